@@ -1,0 +1,1 @@
+"""The command line: arguments in, stage called, outcome printed, exit code."""

@@ -1,0 +1,1 @@
+"""Frozen records that the stages pass on: observations, the rig, results."""

@@ -1,0 +1,1 @@
+"""Boards found in images."""

@@ -1,0 +1,1 @@
+"""Rotations and rigid motions, batch-first, numpy only."""

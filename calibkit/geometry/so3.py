@@ -1,0 +1,106 @@
+"""Rotations SO(3), batch-first: vectors (..., 3), quaternions (..., 4) Hamilton xyzw, matrices (..., 3, 3).
+
+Perturbations are on the right, R exp(hat(d)). Equations: Sola, Deray, Atchuthan, "A micro Lie theory", 2018.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Below this angle the closed forms lose digits to cancellation and the Taylor series is exact to machine precision.
+_SMALL_ANGLE = 1e-4
+
+
+def hat(v: ArrayLike) -> Array:
+    """Return the skew matrix with hat(v) w = v x w, shapes (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def _sinc_terms(angle2: Array) -> tuple[Array, Array]:
+    """Return sin(a)/a and (1 - cos(a))/a^2 from a^2, exact at every angle."""
+    small = angle2 < _SMALL_ANGLE**2
+    safe = np.where(small, 1.0, angle2)
+    angle = np.sqrt(safe)
+    first = np.where(small, 1 - angle2 / 6 * (1 - angle2 / 20), np.sin(angle) / angle)
+    # 2 sin^2(a/2) has no cancellation where 1 - cos(a) has.
+    second = np.where(small, 0.5 - angle2 / 24, 2 * np.sin(angle / 2) ** 2 / safe)
+    return first, second
+
+
+def exp(v: ArrayLike) -> Array:
+    """Return exp(hat(v)) = I + sin(a)/a hat(v) + (1 - cos(a))/a^2 hat(v)^2 (Rodrigues), (..., 3) rad -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    first, second = _sinc_terms(np.sum(v * v, axis=-1))
+    k = hat(v)
+    return np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
+
+
+def right_jacobian(v: ArrayLike) -> Array:
+    """Return J_r with exp(v + d) = exp(v) exp(J_r(v) d) to first order (Sola 2018, eq. 143), (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    angle2 = np.sum(v * v, axis=-1)
+    _, second = _sinc_terms(angle2)
+    small = angle2 < 1e-4  # the third-order term's series: a wider switch, it cancels as a^3
+    safe = np.where(small, 1.0, angle2)
+    angle = np.sqrt(safe)
+    third = np.where(small, 1 / 6 - angle2 / 120 + angle2**2 / 5040, (angle - np.sin(angle)) / (safe * angle))
+    k = hat(v)
+    return np.eye(3) - second[..., None, None] * k + third[..., None, None] * (k @ k)
+
+
+def to_quat(R: ArrayLike) -> Array:
+    """Return unit quaternions xyzw with w >= 0 from rotation matrices (Shepperd 1978: the largest component first)."""
+    R = np.asarray(R, float)
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    choice = np.argmax(np.concatenate([diagonal, trace[..., None]], axis=-1), axis=-1)
+    candidates = np.empty((*R.shape[:-2], 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        candidates[..., i, i] = 1 + 2 * diagonal[..., i] - trace
+        candidates[..., i, j] = R[..., j, i] + R[..., i, j]
+        candidates[..., i, k] = R[..., k, i] + R[..., i, k]
+        candidates[..., i, 3] = R[..., k, j] - R[..., j, k]
+        candidates[..., 3, i] = R[..., k, j] - R[..., j, k]
+    candidates[..., 3, 3] = 1 + trace
+    q: Array = np.take_along_axis(candidates, choice[..., None, None], axis=-2)[..., 0, :]
+    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def from_quat(q: ArrayLike) -> Array:
+    """Return rotation matrices from quaternions xyzw of any length but zero, (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(q, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    k = hat(q[..., :3])
+    return np.eye(3) + 2 * (q[..., 3, None, None] * k + k @ k)
+
+
+def quat_log(q: ArrayLike) -> Array:
+    """Return the rotation vector (|v| <= pi) of quaternions xyzw: 2 atan2(|q_v|, q_w) q_v / |q_v|."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    norm = np.linalg.norm(q[..., :3], axis=-1)
+    small = norm < 1e-9
+    scale = np.where(small, 2.0, 2 * np.arctan2(norm, q[..., 3]) / np.where(small, 1.0, norm))
+    return scale[..., None] * q[..., :3]
+
+
+def log(R: ArrayLike) -> Array:
+    """Return the rotation vector of R, |v| <= pi, accurate up to pi (through the quaternion), (..., 3, 3) -> (..., 3)."""
+    return quat_log(to_quat(R))
+
+
+def project(M: ArrayLike) -> Array:
+    """Return the rotation nearest to M in the Frobenius norm (Arun 1987), (..., 3, 3) -> (..., 3, 3)."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, float))
+    U = U.copy()
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    rotation: Array = U @ Vt
+    return rotation

@@ -1,0 +1,1 @@
+"""Sensor and target models: equations with analytic Jacobians."""

@@ -1,0 +1,1 @@
+"""Reports from saved results: signals, figures, pages, printable boards."""

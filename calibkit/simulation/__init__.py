@@ -1,0 +1,1 @@
+"""Seeded synthetic rigs and recordings with known truth."""

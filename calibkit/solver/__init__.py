@@ -1,0 +1,1 @@
+"""Least squares for every problem: arrowhead structure, robust loss, covariance, observability."""

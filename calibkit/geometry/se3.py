@@ -4,13 +4,12 @@ The retraction perturbs on the right and keeps the parts apart: R <- R exp(phi),
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 
-def make(R: ArrayLike, p: ArrayLike) -> Array:
+def make(R: Array, p: Array) -> Array:
     """Return T = [R p; 0 1] from (..., 3, 3) and (..., 3), broadcast against each other."""
     R, p = np.asarray(R, float), np.asarray(p, float)
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], p.shape[:-1]), 4, 4))
@@ -18,34 +17,34 @@ def make(R: ArrayLike, p: ArrayLike) -> Array:
     return T
 
 
-def inverse(T: ArrayLike) -> Array:
+def inverse(T: Array) -> Array:
     """Return T_b_a = [R^T, -R^T p; 0 1] from T_a_b."""
     T = np.asarray(T, float)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return make(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
-def transform(T: ArrayLike, points: ArrayLike) -> Array:
+def transform(T: Array, points: Array) -> Array:
     """Return p_a = R p_b + p for points (..., n, 3) under T_a_b (..., 4, 4)."""
     T = np.asarray(T, float)
     out: Array = np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
     return out
 
 
-def retract(T: ArrayLike, step: ArrayLike) -> Array:
+def retract(T: Array, step: Array) -> Array:
     """Return T [exp(phi) rho; 0 1] for step (..., 6) = (rho in m, phi in rad), both in T's right-hand frame."""
     T, step = np.asarray(T, float), np.asarray(step, float)
     out: Array = T @ make(so3.exp(step[..., 3:]), step[..., :3])
     return out
 
 
-def local(T: ArrayLike, other: ArrayLike) -> Array:
+def local(T: Array, other: Array) -> Array:
     """Return the step (..., 6) with retract(T, step) = other."""
     d = inverse(T) @ np.asarray(other, float)
     return np.concatenate([d[..., :3, 3], so3.log(d[..., :3, :3])], axis=-1)
 
 
-def adjoint(T: ArrayLike) -> Array:
+def adjoint(T: Array) -> Array:
     """Return Ad with T retract(I, d) T^-1 = retract(I, Ad d) to first order, tangent order (rho, phi), (..., 6, 6)."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]

@@ -4,7 +4,7 @@ Perturbations are on the right, R exp(hat(d)). Equations: Sola, Deray, Atchuthan
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 _SMALL_ANGLE = 1e-4
 
 
-def hat(v: ArrayLike) -> Array:
+def hat(v: Array) -> Array:
     """Return the skew matrix with hat(v) w = v x w, shapes (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, float)
     out = np.zeros((*v.shape[:-1], 3, 3))
@@ -33,15 +33,16 @@ def _sinc_terms(angle2: Array) -> tuple[Array, Array]:
     return first, second
 
 
-def exp(v: ArrayLike) -> Array:
+def exp(v: Array) -> Array:
     """Return exp(hat(v)) = I + sin(a)/a hat(v) + (1 - cos(a))/a^2 hat(v)^2 (Rodrigues), (..., 3) rad -> (..., 3, 3)."""
     v = np.asarray(v, float)
     first, second = _sinc_terms(np.sum(v * v, axis=-1))
     k = hat(v)
-    return np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
+    rotation: Array = np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
+    return rotation
 
 
-def right_jacobian(v: ArrayLike) -> Array:
+def right_jacobian(v: Array) -> Array:
     """Return J_r with exp(v + d) = exp(v) exp(J_r(v) d) to first order (Sola 2018, eq. 143), (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, float)
     angle2 = np.sum(v * v, axis=-1)
@@ -51,10 +52,11 @@ def right_jacobian(v: ArrayLike) -> Array:
     angle = np.sqrt(safe)
     third = np.where(small, 1 / 6 - angle2 / 120 + angle2**2 / 5040, (angle - np.sin(angle)) / (safe * angle))
     k = hat(v)
-    return np.eye(3) - second[..., None, None] * k + third[..., None, None] * (k @ k)
+    jacobian: Array = np.eye(3) - second[..., None, None] * k + third[..., None, None] * (k @ k)
+    return jacobian
 
 
-def to_quat(R: ArrayLike) -> Array:
+def to_quat(R: Array) -> Array:
     """Return unit quaternions xyzw with w >= 0 from rotation matrices (Shepperd 1978: the largest component first)."""
     R = np.asarray(R, float)
     trace = np.trace(R, axis1=-2, axis2=-1)
@@ -74,7 +76,7 @@ def to_quat(R: ArrayLike) -> Array:
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def from_quat(q: ArrayLike) -> Array:
+def from_quat(q: Array) -> Array:
     """Return rotation matrices from quaternions xyzw of any length but zero, (..., 4) -> (..., 3, 3)."""
     q = np.asarray(q, float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -82,7 +84,7 @@ def from_quat(q: ArrayLike) -> Array:
     return np.eye(3) + 2 * (q[..., 3, None, None] * k + k @ k)
 
 
-def quat_log(q: ArrayLike) -> Array:
+def quat_log(q: Array) -> Array:
     """Return the rotation vector (|v| <= pi) of quaternions xyzw: 2 atan2(|q_v|, q_w) q_v / |q_v|."""
     q = np.asarray(q, float)
     q = np.where(q[..., 3:] < 0, -q, q)
@@ -92,12 +94,12 @@ def quat_log(q: ArrayLike) -> Array:
     return scale[..., None] * q[..., :3]
 
 
-def log(R: ArrayLike) -> Array:
+def log(R: Array) -> Array:
     """Return the rotation vector of R, |v| <= pi, accurate up to pi (through the quaternion), (..., 3, 3) -> (..., 3)."""
     return quat_log(to_quat(R))
 
 
-def project(M: ArrayLike) -> Array:
+def project(M: Array) -> Array:
     """Return the rotation nearest to M in the Frobenius norm (Arun 1987), (..., 3, 3) -> (..., 3, 3)."""
     U, _, Vt = np.linalg.svd(np.asarray(M, float))
     U = U.copy()

@@ -34,7 +34,8 @@ class Board(Protocol):
 
 def _grid(columns: int, rows: int, column_step: float, row_step: float) -> Array:
     x, y = np.meshgrid(np.arange(columns) * column_step, np.arange(rows) * row_step)
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    points: Array = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    return points
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ class Charuco:
     @property
     def points(self) -> Array:
         s = self.square_size
-        return _grid(self.columns - 1, self.rows - 1, s, s) + np.array([s, s, 0.0])
+        points: Array = _grid(self.columns - 1, self.rows - 1, s, s) + np.array([s, s, 0.0])
+        return points
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -2,8 +2,15 @@
 
 from calibkit.models.cameras.base import CameraModel, Projection
 from calibkit.models.cameras.kannala_brandt import KannalaBrandt
-from calibkit.models.cameras.pinhole_radtan import PinholeRadtan4, PinholeRadtan5, PinholeRadtan8
+from calibkit.models.cameras.pinhole_radtan import PinholeRadtan
 
-CAMERAS: dict[str, CameraModel] = {model.name: model for model in (PinholeRadtan4(), PinholeRadtan5(), PinholeRadtan8(), KannalaBrandt())}
+_MODELS: tuple[CameraModel, ...] = (
+    PinholeRadtan("pinhole-radtan", 4),
+    PinholeRadtan("pinhole-radtan5", 5),
+    PinholeRadtan("pinhole-radtan8", 8),
+    KannalaBrandt(),
+)
+CAMERAS: dict[str, CameraModel] = {model.name: model for model in _MODELS}
+ALIASES = {"kb4": "pinhole-equi"}  # other names that people know a model by
 
-__all__ = ["CAMERAS", "CameraModel", "Projection"]
+__all__ = ["ALIASES", "CAMERAS", "CameraModel", "Projection"]

@@ -10,14 +10,20 @@ import typer
 from calibkit.errors import CalibkitError, one_line
 from calibkit.version import __version__
 
+# One module `calibkit.cli.NAME` a command, with `register(app)`; --help lists them in this order.
+COMMANDS: tuple[str, ...] = ()
+
+_ANYWHERE = ("--version", "--debug")
+_INTERRUPTED = 130
+_STATE = {"debug": False}
+
 app = typer.Typer(
-    name="calibkit",
     help="Find the hidden unknowns of a sensor rig and say how far each may be trusted.",
-    no_args_is_help=True,
+    epilog="--version and --debug may stand anywhere on the line.",
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # plain help: importing rich would double the time of --help
 )
-_STATE = {"debug": False}
 
 
 def _print_version(asked: bool) -> None:
@@ -29,31 +35,44 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     _STATE["debug"] = debug
 
 
-# One module a command, imported here because a signature is what --help needs; what they call is imported when they run.
-for _name in ():
+# All are imported because --help needs their signatures; what they call is imported when they run.
+for _name in COMMANDS:
     import_module(f"calibkit.cli.{_name}").register(app)
 
 
 def main() -> None:
     """Run the command line; each kind of error is one line on stderr and the exit code of SPEC section 6."""
+    arguments = sys.argv[1:]
     try:
-        app()
+        code = app(_anywhere_first(arguments) or ["--help"], prog_name="calibkit", standalone_mode=False)
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        _fail(error, 2, f"{one_line(error.format_message())} (see {context.command_path if context else 'calibkit'} --help)")
     except CalibkitError as error:
-        _fail(error, error.exit_code, f"calibkit: {one_line(error, 1000)}")
-    except KeyboardInterrupt:
-        typer.echo("calibkit: interrupted, nothing was written", err=True)
-        sys.exit(130)
+        _fail(error, error.exit_code, one_line(error, 1000))
+    except (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError) as error:
+        _fail(error, 2, one_line(error))
     except Exception as error:
-        _fail(error, 4, f"calibkit: internal error: {type(error).__name__}: {one_line(error)} (please report it with --debug's output)")
+        cause = error.__cause__ if isinstance(error, typer.Abort) and error.__cause__ else error  # Typer's Abort hides an EOFError
+        _fail(cause, 4, f"internal error: {type(cause).__name__}: {one_line(cause)} (please report it with --debug's output)")
+    if code == _INTERRUPTED:  # what Typer makes of Ctrl-C
+        typer.echo("calibkit: interrupted, nothing was written", err=True)
+    sys.exit(code if arguments else 2)
 
 
-def _fail(error: Exception, code: int, line: str) -> None:
+def _anywhere_first(arguments: list[str]) -> list[str]:
+    """Move the options that hold for every command before the command's name, where Typer looks for them."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return sorted(arguments[:end], key=lambda word: word not in _ANYWHERE) + arguments[end:]
+
+
+def _fail(error: BaseException, code: int, line: str) -> None:
     if _STATE["debug"]:
         traceback.print_exception(error)
-    typer.echo(line, err=True)
+    typer.echo(f"calibkit: {line}", err=True)
     sys.exit(code)

@@ -1,13 +1,19 @@
 """The rig: every sensor's parameters, the transforms and clock offsets between sensors, each with sigma, status and origin.
 
-This is the schema of the rig file, version 1; `io/rig_file.py` reads and writes it. Unknown keys are refused.
+This is the schema of the rig file, version 1; `io/rig_file.py` reads and writes it. Unknown keys are refused, and so is
+whatever contradicts itself: a quaternion that is not the matrix, a covariance that is none, a sigma beside another variance.
 """
 
+from pathlib import PurePosixPath, PureWindowsPath
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibkit.data.verdict import Status, Verdict
+from calibkit.geometry import se3, so3
+from calibkit.models.cameras import CAMERAS
 
 VERSION = 1
 CONVENTIONS = {
@@ -19,14 +25,25 @@ CONVENTIONS = {
     "units": "SI, angles in radians, pixels px",
 }
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_TOLERANCE = 1e-6  # a matrix written with 7 digits
+_COVARIANCE_TOLERANCE = 1e-9  # of a correlation
+_SIGMA_TOLERANCE = 1e-6  # relative
+
+Finite = Annotated[float, Field(ge=-1e100, le=1e100, allow_inf_nan=False, strict=True)]  # strict: neither true nor "1.0" is a number
+Sigma = Annotated[float, Field(ge=0, le=1e100, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(ge=0, strict=True)]
+Pixels = Annotated[int, Field(gt=0, le=100000, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9]*$", max_length=40)]
 Text = Annotated[str, Field(max_length=2000)]
+Texts = Annotated[list[Text], Field(max_length=1000)]
 Row = Annotated[list[Finite], Field(max_length=400)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Vector4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 Matrix4 = Annotated[list[Vector4], Field(min_length=4, max_length=4)]
+
+
+def _near(a: ArrayLike, b: ArrayLike) -> bool:
+    return bool(np.allclose(a, b, rtol=_TOLERANCE, atol=_TOLERANCE))
 
 
 class Record(BaseModel):
@@ -64,8 +81,26 @@ class Covariance(Record):
         n = len(self.order)
         if len(self.matrix) != n or any(len(row) != n for row in self.matrix):
             raise ValueError(f"matrix must be {n} x {n}, as long as order")
+        if len(set(self.order)) != n:
+            raise ValueError("order names a parameter twice")
         if any(self.matrix[i][i] < 0 for i in range(n)):
             raise ValueError("a variance on the diagonal is negative")
+        return self
+
+    @model_validator(mode="after")
+    def _symmetric_and_positive(self) -> "Covariance":
+        if self.order:
+            C = np.array(self.matrix)
+            scale = np.sqrt(np.diag(C))
+            scale[scale == 0] = 1
+            with np.errstate(over="ignore"):
+                correlation = C / scale / scale[:, None]
+            if not np.abs(correlation).max() <= 1 + _COVARIANCE_TOLERANCE:
+                raise ValueError("matrix has a correlation beyond 1, so it is no covariance")
+            if not np.allclose(correlation, correlation.T, rtol=0, atol=_COVARIANCE_TOLERANCE):
+                raise ValueError("matrix is not symmetric, so it is no covariance")
+            if np.linalg.eigvalsh(correlation)[0] < -_COVARIANCE_TOLERANCE * len(C):
+                raise ValueError("matrix has a negative eigenvalue, so it is no covariance")
         return self
 
 
@@ -75,24 +110,41 @@ class Reprojection(Record):
     rms_px: Sigma
     rms_all_px: Sigma  # dropped corners included
     held_out_rms_px: Sigma | None = None
-    corners: int = 0
-    corners_dropped: int = 0
-    frames: int = 0
-    frames_dropped: int = 0
+    corners: Count = 0
+    corners_dropped: Count = 0
+    frames: Count = 0
+    frames_dropped: Count = 0
 
 
 class Camera(Record):
     """One camera: uv = model(p_cam; parameters)."""
 
     topic: Text | None = None
-    resolution: tuple[Annotated[int, Field(gt=0, le=100000)], Annotated[int, Field(gt=0, le=100000)]]  # width, height px
+    resolution: tuple[Pixels, Pixels]  # width, height
     model: Annotated[str, Field(max_length=40)]
     equation: Text = ""
     parameters: dict[str, Estimate]
     covariance: Covariance | None = None
     reprojection: Reprojection | None = None
     verdict: Verdict | None = None  # None: given, not judged
-    reasons: list[Text] = []
+    reasons: Texts = []
+
+    @model_validator(mode="after")
+    def _as_the_model_has_it(self) -> "Camera":
+        model = CAMERAS.get(self.model)
+        if model is None:
+            raise ValueError(f"the camera model '{self.model}' is not known; it may be one of {', '.join(CAMERAS)}")
+        if self.parameters.keys() != set(model.parameter_names):
+            raise ValueError(f"the parameters of {self.model} are {', '.join(model.parameter_names)}")
+        if self.covariance is not None:
+            strangers = [name for name in self.covariance.order if name not in model.parameter_names]
+            if strangers:
+                raise ValueError(f"covariance.order names '{strangers[0]}', which is no parameter of {self.model}")
+            for i, name in enumerate(self.covariance.order):
+                sigma, variance = self.parameters[name].sigma, self.covariance.matrix[i][i]
+                if sigma is not None and abs(sigma - variance**0.5) > _SIGMA_TOLERANCE * max(sigma, variance**0.5):
+                    raise ValueError(f"the sigma of {name} is {sigma:.6g}, but its covariance says {variance**0.5:.6g}")
+        return self
 
 
 class Imu(Record):
@@ -118,7 +170,24 @@ class Transform(Record):
     covariance: Covariance | None = None  # order rho_x rho_y rho_z phi_x phi_y phi_z, in b's frame
     status: Status = Status.GIVEN
     verdict: Verdict | None = None
-    reasons: list[Text] = []
+    reasons: Texts = []
+
+    @model_validator(mode="after")
+    def _one_motion(self) -> "Transform":
+        T, R, q = np.array(self.matrix), np.array(self.matrix)[:3, :3], np.array(self.rotation_xyzw)
+        if not np.array_equal(T[3], [0, 0, 0, 1]):
+            raise ValueError("the last row of matrix is not 0 0 0 1")
+        if not _near(R @ R.T, np.eye(3)) or np.linalg.det(R) < 0:
+            raise ValueError("the upper left 3 x 3 of matrix is not a rotation")
+        if not _near(q @ q, 1) or not _near(so3.from_quat(q), R):
+            raise ValueError("rotation_xyzw is not the rotation of matrix (order x y z w)")
+        if not _near(self.translation, T[:3, 3]):
+            raise ValueError("translation is not the last column of matrix")
+        if not _near(self.inverse_matrix, se3.inverse(T)):
+            raise ValueError("inverse_matrix is not the inverse of matrix")
+        if self.covariance is not None and len(self.covariance.order) != 6:
+            raise ValueError("the covariance of a transform is 6 x 6")
+        return self
 
 
 class TimeOffset(Record):
@@ -127,7 +196,7 @@ class TimeOffset(Record):
     equation: Text = ""
     offset: Estimate  # s
     verdict: Verdict | None = None
-    reasons: list[Text] = []
+    reasons: Texts = []
 
 
 class InputFile(Record):
@@ -145,8 +214,15 @@ class StageRun(Record):
     calibkit: Annotated[str, Field(max_length=40)]
     inputs: list[InputFile] = []
     options: dict[str, str | float | int | bool | None] = {}
-    residual_file: Text | None = None  # beside the rig file
+    residual_file: Text | None = None  # a bare name: the file lies beside the rig file
     residual_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+
+    @model_validator(mode="after")
+    def _stays_in_its_folder(self) -> "StageRun":
+        name = self.residual_file
+        if name is not None and (name in ("", ".", "..") or {PurePosixPath(name).name, PureWindowsPath(name).name} != {name}):
+            raise ValueError("residual_file must be the bare name of a file beside the rig file")
+        return self
 
 
 class Rig(Record):
@@ -160,3 +236,21 @@ class Rig(Record):
     transforms: dict[Annotated[str, Field(pattern=r"^T_[A-Za-z0-9]+_[A-Za-z0-9]+$")], Transform] = {}
     time_offsets: dict[Annotated[str, Field(pattern=r"^dt_[A-Za-z0-9]+_[A-Za-z0-9]+$")], TimeOffset] = {}
     provenance: Annotated[list[StageRun], Field(max_length=200)] = []
+
+    @model_validator(mode="after")
+    def _means_what_it_says(self) -> "Rig":
+        for key, text in self.conventions.items():
+            if CONVENTIONS.get(key) != text:
+                raise ValueError(f"conventions.{key} is not the convention of this version; a file in other conventions must be imported")
+        for name, entry in self.transforms.items():
+            _, a, b = name.split("_")
+            if entry.inverse_name != f"T_{b}_{a}":
+                raise ValueError(f"transforms.{name} has the inverse T_{b}_{a}, which inverse_name must say")
+        for names in (self.transforms, self.time_offsets):
+            for name in names:
+                kind, a, b = name.split("_")
+                if a == b:
+                    raise ValueError(f"{name} is of one sensor; it needs two")
+                if f"{kind}_{b}_{a}" in names:
+                    raise ValueError(f"{name} and {kind}_{b}_{a} are both given; keep one")
+        return self

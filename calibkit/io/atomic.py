@@ -1,0 +1,76 @@
+"""Files written whole or not at all."""
+
+import os
+import secrets
+import shutil
+import stat
+from pathlib import Path
+
+from calibkit.errors import BadInputError, one_line
+
+
+def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> None:
+    """Write a file by way of a temporary one in the same folder; an existing file is refused unless `overwrite`."""
+    target = Path(os.path.realpath(path))  # through links, so that the link stays one
+    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}.tmp")
+    try:
+        refuse_existing(target, overwrite)
+        try:
+            _write_synced(temporary, content.encode() if isinstance(content, str) else content)
+            if target.exists():
+                shutil.copymode(target, temporary)
+            _move(temporary, target, overwrite)
+        finally:
+            temporary.unlink(missing_ok=True)
+        _sync_folder(target.parent)
+    except FileNotFoundError:
+        raise BadInputError(f"{one_line(path)}: its folder does not exist; create {one_line(target.parent)} first") from None
+    except (OSError, ValueError) as error:
+        raise BadInputError(
+            f"{one_line(path)}: cannot be written ({one_line(getattr(error, 'strerror', None) or error)}); choose another place"
+        ) from None
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise BadInputError where writing `path` would destroy something: to be asked before long work, too."""
+    if path.is_dir():
+        raise BadInputError(f"{one_line(path)}: is a folder; give the name of a file")
+    if not path.exists():
+        return
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise BadInputError(f"{one_line(path)}: is not a regular file; give another name")
+    if not overwrite:
+        raise BadInputError(f"{one_line(path)}: exists already; give another name, or --force to overwrite it")
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:  # 0o666: the umask decides
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _move(temporary: Path, target: Path, overwrite: bool) -> None:
+    if not overwrite:
+        try:
+            os.link(temporary, target)  # unlike a rename, fails where another process was quicker
+        except FileExistsError:
+            refuse_existing(target, overwrite)
+            raise
+        except OSError:  # a file system without hard links
+            refuse_existing(target, overwrite)
+        else:
+            return
+    os.replace(temporary, target)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name != "posix":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:  # some network file systems refuse it; the file itself is synced
+        pass
+    finally:
+        os.close(handle)

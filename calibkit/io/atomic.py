@@ -26,9 +26,12 @@ def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> N
     except FileNotFoundError:
         raise BadInputError(f"{one_line(path)}: its folder does not exist; create {one_line(target.parent)} first") from None
     except (OSError, ValueError) as error:
-        raise BadInputError(
-            f"{one_line(path)}: cannot be written ({one_line(getattr(error, 'strerror', None) or error)}); choose another place"
-        ) from None
+        raise BadInputError(f"{one_line(path)}: cannot be written ({reason_of(error)}); choose another place") from None
+
+
+def reason_of(error: OSError | ValueError) -> str:
+    """Return what the system says about a path, without the path."""
+    return one_line(getattr(error, "strerror", None) or error)
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import yaml
 
 from calibkit.errors import BadInputError, one_line
+from calibkit.io.atomic import reason_of
 
 MAX_BYTES = 4_000_000  # a rig of ten cameras with all covariances is 0.1 MB
 _MAX_DEPTH = 40
@@ -82,9 +83,7 @@ def _read(path: Path, max_bytes: int) -> bytes:
         with path.open("rb") as file:
             content = file.read(max_bytes + 1)
     except (OSError, ValueError) as error:
-        raise BadInputError(
-            f"{one_line(path)}: cannot be read ({one_line(getattr(error, 'strerror', None) or error)}); check the path"
-        ) from None
+        raise BadInputError(f"{one_line(path)}: cannot be read ({reason_of(error)}); check the path") from None
     if len(content) > max_bytes:
         raise BadInputError(f"{one_line(path)}: is larger than {max_bytes} bytes; this cannot be the right file")
     return content

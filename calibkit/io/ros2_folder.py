@@ -1,0 +1,105 @@
+"""A ROS 2 bag's folder: metadata.yaml says which files, the files say what is in them.
+
+rosbags' folder reader matches topics of metadata.yaml and data files by their QoS too, and yields nothing where they differ;
+here the data files are read, and a claim of metadata.yaml that they do not meet is told.
+"""
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from calibkit.errors import BadInputError, one_line
+from calibkit.io.container import Container
+from calibkit.io.db3 import Db3File
+from calibkit.io.mcap import McapFile
+from calibkit.io.ros1_bag import Ros1Bag
+from calibkit.io.unpack import zstd
+
+BAG_FILES: dict[str, Callable[[Path], Container]] = {".bag": Ros1Bag, ".mcap": McapFile, ".db3": Db3File}
+PACKED = (".zstd", ".zst")
+METADATA = "metadata.yaml"
+_MAX_METADATA = 2**24
+_MAX_RATIO = 200  # of a packed file; rosbag2's own are below 20
+
+
+def is_bag_file(path: Path) -> bool:
+    """Tell by its name whether a file is a bag, packed or not."""
+    return (Path(path.stem) if path.suffix in PACKED else path).suffix in BAG_FILES
+
+
+def open_bag_file(path: Path) -> Container:
+    """Open one .bag, .mcap or .db3; a packed one is unpacked to a temporary file that goes with the container."""
+    if path.suffix not in PACKED:
+        return BAG_FILES[path.suffix](path)
+    folder = Path(tempfile.mkdtemp(prefix="calibkit-"))
+    try:
+        unpacked = folder / path.stem
+        _unpack_file(path, unpacked)
+        container = BAG_FILES[unpacked.suffix](unpacked)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    weakref.finalize(container, shutil.rmtree, folder, ignore_errors=True)
+    return container
+
+
+def _unpack_file(path: Path, out: Path) -> None:
+    limit = min(_MAX_RATIO * path.stat().st_size, shutil.disk_usage(out.parent).free - 2**28)
+    written = 0
+    try:
+        with path.open("rb") as packed, zstd.open(packed, "rb") as source, out.open("wb") as target:
+            while block := source.read(2**20):
+                written += len(block)
+                if written > limit:
+                    raise BadInputError(f"{path.name} unpacks to more than {limit} bytes: unpack it yourself (zstd -d) where there is room")
+                target.write(block)
+    except (zstd.ZstdError, EOFError) as error:
+        if written == 0:
+            raise BadInputError(f"{path.name} is no readable zstd file ({one_line(error)}): unpack it yourself (zstd -d)") from error
+
+
+def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, list[str]]:
+    """Return data files, containers, ROS distribution (where stated) and warnings of a ROS 2 bag's folder."""
+    warnings: list[str] = []
+    metadata = _metadata(folder / METADATA, warnings)
+    listed = [folder / Path(str(name)).name for name in metadata.get("relative_file_paths") or []]
+    files = [path for path in listed if path.is_file()]
+    if missing := [path.name for path in listed if path not in files]:
+        warnings.append(f"{folder.name}: {len(missing)} files of {METADATA} are missing: {one_line(', '.join(missing), 120)}")
+    files = files or sorted(path for path in folder.iterdir() if path.is_file() and is_bag_file(path))
+    containers, refused = [], []
+    for path in files:
+        try:
+            containers.append(open_bag_file(path))
+        except BadInputError as error:
+            refused.append(str(error))
+    if not containers:
+        raise BadInputError(f"{folder.name} holds no readable bag file: {refused[0] if refused else 'no .mcap, .db3 or .bag in it'}")
+    warnings += refused
+    held = sum(sum(container.counts.values()) for container in containers)
+    claimed = metadata.get("message_count")
+    if isinstance(claimed, int) and claimed != held:
+        warnings.append(f"{folder.name}: {METADATA} claims {claimed} messages, the data files hold {held}")
+    distro = metadata.get("ros_distro") or next((c.distro for c in containers if isinstance(c, Db3File) and c.distro), None)
+    return files, containers, one_line(distro, 40) if distro else None, warnings
+
+
+def _metadata(path: Path, warnings: list[str]) -> dict[str, Any]:
+    """Return rosbag2_bagfile_information, or nothing where it cannot be read: the data files stand by themselves."""
+    try:
+        if path.stat().st_size > _MAX_METADATA:
+            raise ValueError(f"larger than {_MAX_METADATA} bytes")
+        found = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace"))["rosbag2_bagfile_information"]
+        if not isinstance(found, dict):
+            raise ValueError("no mapping")
+        return found
+    except FileNotFoundError:
+        warnings.append(f"{path.parent.name}: no {METADATA}; the data files in the folder are read")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+        warnings.append(f"{path.parent.name}/{METADATA} is not readable ({one_line(error, 120)}); the data files in the folder are read")
+    return {}

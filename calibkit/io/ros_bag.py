@@ -1,0 +1,229 @@
+"""ROS 1 and ROS 2 bags as a `Source`: files opened by what they are, messages decoded into observations when asked."""
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
+from calibkit.data.progress import Progress
+from calibkit.errors import BadInputError, one_line
+from calibkit.io import images, ros_messages
+from calibkit.io.container import Container, Message
+from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo, seconds_text
+from calibkit.io.unpack import UnpackError, unpack_message
+
+T = TypeVar("T")
+_BATCH = 4096  # Imu messages decoded at once
+_PATIENCE = 10  # messages without a stamp to hold back until one has a stamp
+
+
+def restamp(messages: Iterable[tuple[int, int, T]], zeros: list[int]) -> Iterator[tuple[int, T]]:
+    """Yield (time, item) from (header, record, item): header times; where they are zero, record times on the header's clock.
+
+    A zero stamp takes its record time plus the latest known difference of the two clocks (0 when no header has a time).
+    The record times of zero stamps are appended to `zeros`.
+    """
+    difference: int | None = None
+    held: list[tuple[int, T]] = []
+    for header, record, item in messages:
+        if header == 0:
+            zeros.append(record)
+            held.append((record, item))
+        else:
+            difference = header - record
+        if difference is not None or len(held) > _PATIENCE:
+            yield from ((time + (difference or 0), waiting) for time, waiting in held)
+            held.clear()
+        if header != 0:
+            yield header, item
+    yield from ((time + (difference or 0), waiting) for time, waiting in held)
+
+
+class _Bag:
+    """All bag files of one recording, read topic by topic."""
+
+    def __init__(self, containers: list[Container], distro: str | None, source: Source) -> None:
+        self.containers = sorted(containers, key=lambda c: c.start_ns)
+        self.distro = distro
+        self.source = source
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics, compressed ones unpacked; count what is lost or missing."""
+        for container in self.containers:
+            claimed = sum(count for channel, count in container.counts.items() if channel.topic in topics)
+            seen = broken = 0
+            for message in container.messages(topics):
+                seen += 1
+                try:
+                    yield message._replace(payload=unpack_message(message.payload))
+                except UnpackError:
+                    broken += 1
+            if broken:
+                self.source.warn(f"{container.path.name}: {broken} compressed messages are damaged and left out")
+            if seen < claimed:
+                self.source.warn(f"{container.path.name} claims {claimed} messages of {_names(topics)} but holds {seen}")
+            for warning in container.warnings:
+                self.source.warn(warning)
+
+    def stamped(self, topic: str) -> Iterator[tuple[int, Message]]:
+        """Yield the messages of a topic with their times."""
+        zeros: list[int] = []
+        triples = ((ros_messages.header_ns(m.payload, m.channel.encoding), m.record_ns, m) for m in self.messages([topic]))
+        yield from restamp(triples, zeros)
+        if zeros:
+            self.source.warn(f"{topic}: {len(zeros)} header stamps are zero: record times are used for them")
+
+    def decoded(self, messages: Iterable[tuple[int, Message]], topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield the messages that can be decoded; count the others."""
+        broken = 0
+        for t_ns, message in messages:
+            try:
+                decoded = ros_messages.deserialize(message.payload, message.channel.type, message.channel.encoding, self.distro)
+            except ros_messages.DECODE_ERRORS:
+                broken += 1
+                continue
+            yield t_ns, decoded
+        if broken:
+            self.source.warn(f"{topic}: {broken} damaged messages are left out")
+
+    def images(self, topic: str) -> Iterator[ImageFrame]:
+        for t_ns, message in self.stamped(topic):
+            label = seconds_text(t_ns)
+            where = f"{self.source.name}: {topic} at {label}"
+            yield ImageFrame(t_ns, label, message.payload, partial(decode_image, message, where, self.distro))
+
+    def imu(self, topic: str) -> ImuSamples:
+        stamped = self.stamped(topic)
+        times, gyros, accels = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
+        lost = 0
+        while batch := list(islice(stamped, _BATCH)):
+            gyro, accel, whole = ros_messages.decode_imu([m.payload for _, m in batch], batch[0][1].channel.encoding)
+            whole &= np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+            lost += int(np.sum(~whole))
+            times.append(np.array([t_ns for t_ns, _ in batch], np.int64)[whole])
+            gyros.append(gyro[whole])
+            accels.append(accel[whole])
+        if lost:
+            self.source.warn(f"{topic}: {lost} samples are damaged or not finite and left out")
+        return ImuSamples(np.concatenate([np.zeros(0, np.int64), *times]), np.concatenate(gyros), np.concatenate(accels))
+
+    def poses(self, topic: str) -> PoseSamples:
+        rows: list[tuple[int, ros_messages.Pose]] = []
+        for t_ns, message in self.decoded(self.stamped(topic), topic):
+            rows.append((t_ns, ros_messages.POSES[message.__msgtype__](message)))
+        samples, lost = pose_samples(rows, topic)
+        if lost:
+            self.source.warn(f"{topic}: {lost} poses have no proper rotation or are not finite, and are left out")
+        return samples
+
+    def camera_info(self, topic: str) -> CameraInfo:
+        for _, message in self.decoded(self.stamped(topic), topic):
+            fields = {name.lower(): value for name, value in vars(message).items()}  # ROS 1 has K and D, ROS 2 k and d
+            return CameraInfo(
+                message.width,
+                message.height,
+                one_line(message.distortion_model, 60),
+                np.array(fields["k"], float).reshape(3, 3),
+                np.array(fields["d"], float),
+                one_line(message.header.frame_id, 100),
+            )
+        raise BadInputError(f"{self.source.name}: {topic} holds no readable CameraInfo")
+
+    def edges(self) -> dict[tuple[str, str], Edge]:
+        """Read every tf topic once; a topic called ...static holds transforms that are valid always."""
+        rows: dict[tuple[str, str, bool], list[tuple[int, ros_messages.Pose]]] = {}
+        for topic in (t.name for t in self.source.topics if t.kind == "tf"):
+            for record_ns, message in self.decoded(((m.record_ns, m) for m in self.messages([topic])), topic):
+                for entry in message.transforms:
+                    t_ns = entry.header.stamp.sec * 10**9 + entry.header.stamp.nanosec or record_ns
+                    pose = ros_messages.transform(entry)
+                    key = pose[2].strip("/"), pose[3].strip("/"), topic.endswith("static")
+                    rows.setdefault(key, []).append((t_ns, pose))
+        return {(parent, child): Edge(pose_samples(found, child)[0], static) for (parent, child, static), found in rows.items()}
+
+    def survey(self, progress: Progress) -> dict[str, Stamps]:
+        """Read all times of all topics in one pass."""
+        headed = {c for container in self.containers for c in container.counts if ros_messages.starts_with_header(c.type)}
+        total = sum(topic.count for topic in self.source.topics)
+        found: dict[str, tuple[list[int], list[int]]] = {topic.name: ([], []) for topic in self.source.topics}
+        for message in progress(self.messages(found.keys()), "reading", total):
+            headers, records = found[message.channel.topic]
+            records.append(message.record_ns)
+            if message.channel in headed:
+                headers.append(ros_messages.header_ns(message.payload, message.channel.encoding))
+        return {
+            name: Stamps(np.array(headers, np.int64) if len(headers) == len(records) else None, np.array(records, np.int64))
+            for name, (headers, records) in found.items()
+        }
+
+
+def decode_image(message: Message, where: str, distro: str | None) -> images.Gray:
+    """Return a message's image as gray; BadInputError when it is damaged or coded as video."""
+    try:
+        image = ros_messages.deserialize(message.payload, message.channel.type, message.channel.encoding, distro)
+    except ros_messages.DECODE_ERRORS as error:
+        raise BadInputError(f"{where}: the message is damaged ({one_line(error, 120)})") from error
+    if message.channel.type == ros_messages.COMPRESSED:
+        if ros_messages.is_video(image.format):
+            raise BadInputError(f"{where}: format {one_line(image.format, 60)!r} is no still image: record it as jpeg or png")
+        return images.decode_compressed(image.data, where)
+    return images.decode_raw(image.width, image.height, image.encoding, bool(image.is_bigendian), image.step, image.data, where)
+
+
+def pose_samples(rows: list[tuple[int, ros_messages.Pose]], child: str) -> tuple[PoseSamples, int]:
+    """Return the poses with unit quaternions, and how many had none and were left out."""
+    t_ns = np.array([t for t, _ in rows], np.int64)
+    p = np.array([(p.x, p.y, p.z) for _, (p, _, _, _) in rows], float).reshape(-1, 3)
+    q = np.array([(q.x, q.y, q.z, q.w) for _, (_, q, _, _) in rows], float).reshape(-1, 4)
+    frames = [(parent, name) for _, (_, _, parent, name) in rows[:1]] or [("", "")]
+    return unit_poses(t_ns, q, p, one_line(frames[0][0], 100), one_line(frames[0][1], 100) or child)
+
+
+def unit_poses(t_ns: np.ndarray[Any, np.dtype[np.int64]], q: Any, p: Any, parent: str, child: str) -> tuple[PoseSamples, int]:
+    """Return poses with quaternions made unit, leaving out those further than 10 % from it or not finite; and how many."""
+    norm = np.linalg.norm(q, axis=1)
+    good = np.isfinite(p).all(axis=1) & (np.abs(norm - 1) < 0.1)
+    return PoseSamples(t_ns[good], q[good] / norm[good, None], p[good], parent, child), int(np.sum(~good))
+
+
+def _names(topics: Iterable[str]) -> str:
+    names = sorted(topics)
+    return names[0] if len(names) == 1 else f"{len(names)} topics"
+
+
+def bag_source(name: str, files: list[Path], containers: list[Container], distro: str | None, warnings: list[str]) -> Source:
+    """Return the topics of bag files and how to read them; `distro` is the ROS 2 distribution, where known."""
+    source = Source(name, files, warnings=list(warnings))
+    bag = _Bag(containers, distro, source)
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for container in containers:
+        for warning in container.warnings:
+            source.warn(warning)
+        for channel, count in container.counts.items():
+            counts[channel.topic, channel.type, channel.encoding] += count
+            standard = ros_messages.standard_md5(channel.type) if channel.md5 not in ("", "*") else None
+            if standard and channel.md5 != standard:
+                source.warn(f"{channel.topic}: its definition of {channel.type} is not the standard one (md5 {one_line(channel.md5, 40)})")
+    readers: dict[str, tuple[dict[str, Any], Any]] = {
+        "image": (source.images, bag.images),
+        "imu": (source.imu, bag.imu),
+        "pose": (source.poses, bag.poses),
+        "camera_info": (source.camera_info, bag.camera_info),
+    }
+    for (topic, kind_of, encoding), count in sorted(counts.items()):
+        kind = ros_messages.KINDS.get(kind_of, "other") if encoding in ros_messages.ENCODINGS else "other"
+        if kind == "image" and topic.endswith("/compressedDepth"):
+            kind = "video"
+        source.topics.append(TopicInfo(topic, kind_of, kind, count))
+        if kind in readers:
+            table, read = readers[kind]
+            table[topic] = partial(read, topic)
+    source.survey = bag.survey
+    if any(topic.kind == "tf" for topic in source.topics):
+        source.edges = bag.edges
+    return source

@@ -1,0 +1,108 @@
+"""What every kind of recording is turned into: topics, and for each kind of topic a way to read it when asked."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
+from calibkit.data.progress import Progress
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+# What a topic of each kind is good for, as `calibkit info` tells it.
+USES = {
+    "image": "intrinsics (with --target), joint, handeye, timeoffset",
+    "imu": "allan, imu-intrinsics, joint, timeoffset",
+    "pose": "handeye, timeoffset",
+    "tf": "handeye, timeoffset (poses between two of its frames)",
+    "camera_info": "start value for intrinsics, or the intrinsics for other stages",
+    "corners": "intrinsics, joint (with --target)",
+    "cloud": "LiDAR stages, later",
+    "video": "nothing: video-coded images are not read; record sensor_msgs/CompressedImage (jpeg or png) instead",
+    "other": "nothing",
+}
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic as its files describe it."""
+
+    name: str
+    type: str  # ROS type, or what the file is ("image folder", "IMU CSV")
+    kind: str  # a key of USES
+    count: int  # messages that the files' indices claim
+
+    @property
+    def usable_for(self) -> str:
+        return USES[self.kind]
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """Times of one topic's messages in the order of the file."""
+
+    header_ns: Times | None  # (n,) None: this type has no header
+    record_ns: Times  # (n,)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A driver's own calibration of a camera, as sensor_msgs/CameraInfo has it."""
+
+    width: int
+    height: int
+    model: str  # plumb_bob, rational_polynomial, equidistant
+    K: Array  # (3, 3) px
+    D: Array  # (n,)
+    frame: str
+
+
+@dataclass(frozen=True)
+class CornerRows:
+    """Board corners from a file, not yet laid against a board."""
+
+    file: str
+    t_ns: Times  # (n,)
+    corner: NDArray[np.int64]  # (n,) 4 tag_id + corner_idx
+    uv: Array  # (n, 2) px
+    xyz: Array | None  # (n, 3) m, where the file says where it thinks the corner is
+    sigma_px: Array | None  # (n,)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Transforms of one parent-child pair of a tf tree, T_parent_child."""
+
+    poses: PoseSamples
+    static: bool
+
+
+@dataclass
+class Source:
+    """One recording, or one part of a recording: nothing is read before it is asked for."""
+
+    name: str
+    files: list[Path]
+    topics: list[TopicInfo] = field(default_factory=list)
+    images: dict[str, Callable[[], Iterator[ImageFrame]]] = field(default_factory=dict)
+    imu: dict[str, Callable[[], ImuSamples]] = field(default_factory=dict)
+    poses: dict[str, Callable[[], PoseSamples]] = field(default_factory=dict)
+    camera_info: dict[str, Callable[[], CameraInfo]] = field(default_factory=dict)
+    corners: dict[str, Callable[[], CornerRows]] = field(default_factory=dict)
+    edges: Callable[[], dict[tuple[str, str], Edge]] | None = None
+    survey: Callable[[Progress], dict[str, Stamps]] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        """Note once what a reader of the result must know."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+
+def seconds_text(t_ns: int) -> str:
+    """Return the stamp in seconds, every digit of it."""
+    return f"{t_ns // 10**9}.{t_ns % 10**9:09d}"

@@ -39,7 +39,10 @@ def test_boards_show_their_printed_side_at_all_tilts(board: Board) -> None:
     assert tilt.min() < 0.1 * np.pi / 4
 
 
-@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=lambda c: c.model.name)
+NARROW_FISHEYE = SimCamera(CAMERAS["pinhole-equi"], np.array([350.0, 351.0, 374.0, 243.0, -0.01, 0.03, -0.02, 0.005]), (752, 480))
+
+
+@pytest.mark.parametrize("camera", [RADTAN, NARROW_FISHEYE], ids=lambda c: c.model.name)
 def test_the_whole_image_is_covered(camera: SimCamera) -> None:
     views, _ = simulate_board_views(camera, BOARDS[0], 100, seed=2)
     width, height = camera.size
@@ -57,3 +60,10 @@ def test_without_noise_the_corners_are_exact_and_weighed_as_one_pixel() -> None:
     views, truth = simulate_board_views(RADTAN, BOARDS[0], 5, seed=0, noise_px=0.0)
     assert np.array_equal(views.uv, truth.uv)
     assert np.all(views.sigma_px == 1.0)
+
+
+def test_no_corners_where_the_lens_ends() -> None:
+    views, truth = simulate_board_views(FISHEYE, BOARDS[0], 200, seed=0)
+    points = se3.transform(truth.T_cam_board, BOARDS[0].points)[views.frame, views.corner]
+    angle = np.arctan2(np.linalg.norm(points[:, :2], axis=-1), points[:, 2])
+    assert np.radians(90) < angle.max() < np.radians(102)  # this lens turns back at 107 deg

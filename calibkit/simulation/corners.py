@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from calibkit.data.observations import BoardViews
 from calibkit.geometry import se3
 from calibkit.models.board import Board
+from calibkit.models.cameras.base import Projection
 from calibkit.simulation.camera import SimCamera, inside, random_board_poses
 
 Array = NDArray[np.float64]
 
 _EDGE_PX = 3.0  # a detector needs a few pixels around a corner
+_SQUEEZED = 0.5  # near a fisheye's end lengths shrink to less than this share of the centre's, and no detector finds corners
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,10 @@ def views_of_poses(
 
     Rows state sigma_px = noise_px, or 1 px when there is no noise.
     """
-    seen = camera.model.project(se3.transform(T_cam_board, board.points), camera.params)
+    points = se3.transform(T_cam_board, board.points)
+    seen = camera.model.project(points, camera.params, jacobians=True)
     visible = seen.valid & inside(camera, seen.uv, _EDGE_PX)
+    visible[visible] = _least_magnification(camera, points[visible], seen, visible) > _SQUEEZED
     kept = np.flatnonzero(visible.any(axis=-1))
     frame, corner = np.nonzero(visible[kept])
     uv = seen.uv[kept][frame, corner]
@@ -54,6 +58,14 @@ def views_of_poses(
         n_images=len(T_cam_board),
     )
     return views, ViewsTruth(camera, T_cam_board[kept], uv)
+
+
+def _least_magnification(camera: SimCamera, points: Array, seen: Projection, rows: NDArray[np.bool_]) -> Array:
+    """Return px per rad over the focal length in the direction in which it is least: the smaller singular value of |p| duv/dp / f."""
+    assert seen.J_point is not None
+    J = seen.J_point[rows] * np.linalg.norm(points, axis=-1)[:, None, None] / camera.params[:2, None]
+    squared: Array = np.linalg.eigvalsh(J @ np.swapaxes(J, -1, -2))[:, 0]
+    return np.sqrt(np.maximum(squared, 0))
 
 
 def simulate_board_views(camera: SimCamera, board: Board, n_frames: int, seed: int, noise_px: float = 0.2) -> tuple[BoardViews, ViewsTruth]:

@@ -1,0 +1,209 @@
+"""Reprojection of board corners as an arrowhead problem: board poses are the core, lenses and camera positions the border.
+
+r = (uv - project(T_c_cam0 T_cam0_board p_board; lens_c)) / sigma
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+from calibkit.models.cameras import CameraModel
+from calibkit.solver.arrowhead import Arrowhead, BlockDiagonal
+from calibkit.solver.robust import cauchy
+
+_CHUNK_POINTS = 8192  # points a chunk: its planes stay in the second-level cache
+_THREADED_POINTS = 4 * _CHUNK_POINTS
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """One camera's corners on a dense grid (view, corner); an absent corner has weight 0."""
+
+    model: CameraModel
+    instant: NDArray[np.int64]  # (f,) which board pose each view belongs to
+    uv: Array  # (f, n, 2) px
+    weight: Array  # (f, n) 1/sigma in 1/px, 0: absent
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class LensState:
+    """The unknowns: a lens per camera, each camera's T_cam_cam0, each instant's T_cam0_board."""
+
+    lenses: tuple[Array, ...]
+    T_cam_cam0: Array  # (c, 4, 4), the first is the identity
+    T_cam0_board: Array  # (m, 4, 4)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one camera at a state."""
+
+    px: Array  # (f, n, 2) measured minus predicted, 0 where absent
+    seen: NDArray[np.bool_]  # (f, n) observed and inside the model's domain
+    distance: Array  # (f, n) m from the camera
+    board_normal: Array  # (f, 3) in the camera frame
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Normal equations by instant: A (m, 6, 6), B (m, 6, p), C (m, p, p) and the gradients."""
+
+    A: Array
+    B: Array
+    C: Array
+    g_x: Array
+    g_c: Array
+
+
+@dataclass(frozen=True)
+class CameraProblem:
+    """Joint calibration of one or several cameras that look at one board."""
+
+    points: Array  # (n, 3) m
+    cameras: tuple[CameraViews, ...]
+    loss_scale: float = np.inf  # Cauchy's, in sigmas
+    free_lens: bool = True
+    free_rig: bool = True
+
+    @property
+    def lens_slices(self) -> tuple[slice, ...]:
+        """Where each camera's lens stands in the border."""
+        ends = np.cumsum([len(c.model.parameter_names) for c in self.cameras])
+        return tuple(slice(int(end) - len(c.model.parameter_names), int(end)) for c, end in zip(self.cameras, ends, strict=True))
+
+    def rig_slice(self, camera: int) -> slice:
+        """Where T_cam_cam0's tangent (rho, phi) of camera 1, 2, ... stands in the border."""
+        start = self.lens_slices[-1].stop + 6 * (camera - 1)
+        return slice(start, start + 6)
+
+    @property
+    def border_size(self) -> int:
+        return int(self.lens_slices[-1].stop + 6 * (len(self.cameras) - 1))
+
+    def retract(self, x: LensState, core: Array, border: Array) -> LensState:
+        T_cam_cam0 = x.T_cam_cam0.copy()
+        for c in range(1, len(self.cameras)):
+            T_cam_cam0[c] = se3.retract(T_cam_cam0[c], border[self.rig_slice(c)])
+        lenses = tuple(lens + border[s] for lens, s in zip(x.lenses, self.lens_slices, strict=True))
+        return LensState(lenses, T_cam_cam0, se3.retract(x.T_cam0_board, core))
+
+    def linearize(self, x: LensState) -> tuple[float, Arrowhead]:
+        cost, parts = self._normal_parts(x)
+        B, C, g_c = parts.B, parts.C.sum(axis=0), parts.g_c.sum(axis=0)
+        self._fix(B, C, g_c)
+        return cost, Arrowhead(BlockDiagonal(parts.A), B, C, parts.g_x, g_c)
+
+    def information(self, x: LensState) -> tuple[Array, Array]:
+        """Return each instant's information S_i (m, p, p) about the border and its projected score (m, p) at x."""
+        _, parts = self._normal_parts(x)
+        solved = BlockDiagonal(parts.A).solve(np.concatenate([parts.B, parts.g_x[:, :, None]], axis=2))
+        nuisance = np.swapaxes(parts.B, 1, 2) @ solved
+        return parts.C - nuisance[:, :, :-1], parts.g_c - nuisance[:, :, -1]
+
+    def _normal_parts(self, x: LensState) -> tuple[float, "_Parts"]:
+        """Return the cost and each instant's part of the normal equations."""
+        m, p = len(x.T_cam0_board), self.border_size
+        parts = _Parts(np.zeros((m, 6, 6)), np.zeros((m, 6, p)), np.zeros((m, p, p)), np.zeros((m, 6)), np.zeros((m, p)))
+        cost = 0.0
+        pose = np.arange(6)
+        for c, views in enumerate(self.cameras):
+            columns = np.arange(p)[self.lens_slices[c]]
+            if c:
+                columns = np.concatenate([np.arange(p)[self.rig_slice(c)], columns])
+            for rows, G, part in self._map_chunks(x, c, views):
+                cost += part
+                at = views.instant[rows]
+                parts.A[at] += G[:, :6, :6]
+                parts.B[np.ix_(at, pose, columns)] += G[:, :6, 6:-1]
+                parts.C[np.ix_(at, columns, columns)] += G[:, 6:-1, 6:-1]
+                parts.g_x[at] += G[:, :6, -1]
+                parts.g_c[np.ix_(at, columns)] += G[:, 6:-1, -1]
+        # An instant whose corners were all given up must not make the core singular.
+        scale = np.einsum("mii->m", parts.A)
+        ridge = 1e-12 * scale + np.where(scale > 0, 0.0, 1.0)
+        parts.A[:] += ridge[:, None, None] * np.eye(6)
+        return cost, parts
+
+    def _fix(self, B: Array, C: Array, g_c: Array) -> None:
+        """Hold what is not free: its rows and columns become an identity without coupling."""
+        lens_end = self.lens_slices[-1].stop
+        fixed = np.zeros(self.border_size, bool)
+        fixed[:lens_end], fixed[lens_end:] = not self.free_lens, not self.free_rig
+        B[:, :, fixed] = 0
+        C[fixed, :], C[:, fixed], g_c[fixed] = 0, 0, 0
+        C[fixed, fixed] = 1
+
+    def _map_chunks(self, x: LensState, c: int, views: CameraViews) -> list[tuple[slice, Array, float]]:
+        f, n = views.weight.shape
+        size = max(1, _CHUNK_POINTS // n)
+        chunks = [slice(start, min(start + size, f)) for start in range(0, f, size)]
+
+        def one(rows: slice) -> tuple[slice, Array, float]:
+            G, cost = self._normal_blocks(x, c, views, rows)
+            return rows, G, cost
+
+        if f * n < _THREADED_POINTS:
+            return [one(rows) for rows in chunks]
+        with ThreadPoolExecutor(2) as pool:  # numpy lets go of the GIL in its kernels; the order of the sums stays fixed
+            return list(pool.map(one, chunks))
+
+    def _normal_blocks(self, x: LensState, c: int, views: CameraViews, rows: slice) -> tuple[Array, float]:
+        """Return per view K K^T of its stacked K = [pose | rig | lens | residual] (columns, 2 n), and the cost."""
+        weight, T_rig = views.weight[rows], x.T_cam_cam0[c]
+        T_board = x.T_cam0_board[views.instant[rows]]
+        T = T_rig @ T_board
+        in_camera = se3.transform(T, self.points)
+        projection = views.model.project(in_camera, x.lenses[c], jacobians=True)
+        assert projection.J_point is not None
+        assert projection.J_params is not None
+        usable = (weight > 0) & projection.valid
+        r = np.where(usable[..., None], views.uv[rows] - projection.uv, 0.0) * weight[..., None]
+        loss, down = cauchy(r[..., 0] ** 2 + r[..., 1] ** 2, self.loss_scale)
+        # A corner that leaves the model's domain costs as much as one a whole image away: no gain in pushing it out.
+        lost = (weight > 0) & ~projection.valid
+        penalty, _ = cauchy((max(views.image_size) * weight[lost]) ** 2, self.loss_scale)
+        cost = float(np.sum(loss[usable]) + np.sum(penalty))
+
+        f, n = weight.shape
+        lens_size = len(x.lenses[c])
+        rig_size = 6 if c else 0
+        K = np.zeros((f, 6 + rig_size + lens_size + 1, 2, n))
+        w = np.where(usable, weight * np.sqrt(down), 0.0)
+        J_point = np.moveaxis(projection.J_point, (-2, -1), (0, 1))  # (2, 3, f, n)
+        J_lens = np.moveaxis(projection.J_params, (-2, -1), (0, 1))
+        R = T[:, :3, :3]
+        X = self.points.T
+        in_cam0 = se3.transform(T_board, self.points) if c else in_camera
+        for d in range(2):
+            a = J_point[d] * w  # (3, f, n), d uv / d p_cam
+            along = [a[0] * R[:, None, 0, k] + a[1] * R[:, None, 1, k] + a[2] * R[:, None, 2, k] for k in range(3)]
+            _rigid_columns(K[:, :6, d], along, (X[0], X[1], X[2]))
+            if c:
+                along = [a[0] * T_rig[0, k] + a[1] * T_rig[1, k] + a[2] * T_rig[2, k] for k in range(3)]
+                _rigid_columns(K[:, 6:12, d], along, (in_cam0[..., 0], in_cam0[..., 1], in_cam0[..., 2]))
+            K[:, 6 + rig_size : -1, d] = np.moveaxis(J_lens[d] * w, 0, 1)
+            K[:, -1, d] = r[..., d] * np.sqrt(down)
+        rows_of_K: Array = K.reshape(f, -1, 2 * n)
+        return rows_of_K @ np.swapaxes(rows_of_K, 1, 2), cost
+
+    def residuals(self, x: LensState, c: int) -> Residuals:
+        """Return camera c's residuals in px at a state."""
+        views = self.cameras[c]
+        T = x.T_cam_cam0[c] @ x.T_cam0_board[views.instant]
+        in_camera = se3.transform(T, self.points)
+        projection = views.model.project(in_camera, x.lenses[c])
+        seen = (views.weight > 0) & projection.valid
+        px = np.where(seen[..., None], views.uv - projection.uv, 0.0)
+        return Residuals(px, seen, np.linalg.norm(in_camera, axis=-1), T[:, :3, 2])
+
+
+def _rigid_columns(K: Array, along: list[Array], X: tuple[Array, Array, Array]) -> None:
+    """Write the columns of a right perturbation T exp(rho, phi) of points X: d p / d rho = R, d p / d phi = -R hat(X)."""
+    for k in range(3):
+        K[:, k] = along[k]
+        K[:, 3 + k] = X[(k + 1) % 3] * along[(k + 2) % 3] - X[(k + 2) % 3] * along[(k + 1) % 3]

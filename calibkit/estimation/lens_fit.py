@@ -1,0 +1,202 @@
+"""Lenses, camera positions and board poses from board corners: seed, robust solve, outliers given up, plain least squares."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.observations import BoardViews
+from calibkit.errors import NotConvergedError
+from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState, Residuals
+from calibkit.estimation.camera_rig_seed import Instants, seed_rig
+from calibkit.estimation.lens_seed import seed_camera
+from calibkit.geometry.so3 import Array
+from calibkit.models.cameras import CAMERAS
+from calibkit.solver.arrowhead import Arrowhead
+from calibkit.solver.levenberg_marquardt import minimise
+from calibkit.solver.robust import scale_of_norms
+
+MIN_CORNERS = 6  # a view's pose alone takes six numbers
+_OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
+_NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
+_BAD_VIEW = 6.0  # and one this much noisier is given up
+_ROBUST_ROUNDS = 3
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class DroppedView:
+    """A view that did not take part, and why."""
+
+    camera: str
+    label: str
+    why: str
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """Cameras of one component at the optimum."""
+
+    views: tuple[BoardViews, ...]  # of the views that took part
+    problem: CameraProblem  # plain least squares, given-up corners with weight 0
+    state: LensState
+    system: Arrowhead
+    observed: tuple[Mask, ...]  # (f, n) per camera: corners found
+    dropped: tuple[DroppedView, ...]
+    converged: bool
+
+    @property
+    def kept(self) -> tuple[Mask, ...]:
+        """Return the corners that took part."""
+        return tuple(camera.weight > 0 for camera in self.problem.cameras)
+
+    def residuals(self, c: int) -> tuple[Residuals, Residuals]:
+        """Return camera c's residuals over the kept corners, and over all that were found in these views."""
+        every = replace(self.problem.cameras[c], weight=self.observed[c].astype(float))
+        whole = replace(self.problem, cameras=(*self.problem.cameras[:c], every, *self.problem.cameras[c + 1 :]))
+        return self.problem.residuals(self.state, c), whole.residuals(self.state, c)
+
+
+def dense_views(views: BoardViews, model: str, instant: NDArray[np.int64]) -> CameraViews:
+    """Return the views as a (view, corner) grid for one camera model; rows with too few corners have weight 0."""
+    f, n = views.n_frames, len(views.board.points)
+    uv, weight = np.zeros((f, n, 2)), np.zeros((f, n))
+    uv[views.frame, views.corner] = views.uv
+    weight[views.frame, views.corner] = 1 / views.sigma_px
+    return CameraViews(CAMERAS[model], instant, uv, weight, views.image_size)
+
+
+def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: Instants, robust: bool = True) -> LensFit:
+    """Return the maximum-likelihood lenses, T_cam_cam0 and board poses of cameras that share instants.
+
+    Raises NotConvergedError naming the camera when there is no start or the solver ends nowhere.
+    """
+    points = cameras[0].board.points
+    dropped: list[DroppedView] = []
+    used: list[BoardViews] = []
+    grids: list[CameraViews] = []
+    lenses, poses, errors = [], [], []
+    for views, model, instant in zip(cameras, models, instants, strict=True):
+        enough = np.bincount(views.frame, minlength=views.n_frames) >= MIN_CORNERS
+        dropped += [DroppedView(views.camera, views.labels[i], f"fewer than {MIN_CORNERS} corners") for i in np.flatnonzero(~enough)]
+        views = views.select(enough)
+        if not views.n_frames:
+            raise NotConvergedError(f"{views.camera}: no view has {MIN_CORNERS} corners or more: check the target file against the board")
+        grid = dense_views(views, model, instant[enough])
+        lens, seeds = seed_camera(grid, points)
+        found = np.isfinite(seeds.error)
+        dropped += [DroppedView(views.camera, views.labels[i], "no board pose fits its corners") for i in np.flatnonzero(~found)]
+        used.append(views.select(found))
+        grids.append(_rows(grid, found))
+        lenses.append(lens)
+        poses.append(seeds.T_cam_board[found])
+        errors.append(seeds.error[found])
+    _renumber(grids)
+    T_cam_cam0, T_cam0_board = seed_rig(tuple(g.instant for g in grids), poses, errors)
+    problem = CameraProblem(points, tuple(grids))
+    return _solve(used, problem, LensState(tuple(lenses), T_cam_cam0, T_cam0_board), dropped, robust)
+
+
+def refit(fit: LensFit, frames: Sequence[Mask]) -> LensFit:
+    """Return the plain fit of some of the views of one that is done, started from it."""
+    grids = [_rows(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
+    kept = _renumber(grids)
+    state = replace(fit.state, T_cam0_board=fit.state.T_cam0_board[kept])
+    solution = minimise(replace(fit.problem, cameras=tuple(grids)), state)
+    return LensFit(
+        tuple(views.select(rows) for views, rows in zip(fit.views, frames, strict=True)),
+        replace(fit.problem, cameras=tuple(grids)),
+        solution.x,
+        solution.system,
+        tuple(mask[rows] for mask, rows in zip(fit.observed, frames, strict=True)),
+        fit.dropped,
+        solution.converged,
+    )
+
+
+def _rows(grid: CameraViews, rows: Mask) -> CameraViews:
+    return replace(grid, instant=grid.instant[rows], uv=grid.uv[rows], weight=grid.weight[rows])
+
+
+def _renumber(grids: list[CameraViews]) -> NDArray[np.int64]:
+    """Close the gaps in the instants' numbers after views were dropped; return the old numbers that stay."""
+    kept, renumbered = np.unique(np.concatenate([g.instant for g in grids]), return_inverse=True)
+    ends = np.cumsum([len(g.instant) for g in grids])
+    for c, part in enumerate(np.split(renumbered, ends[:-1])):
+        grids[c] = replace(grids[c], instant=part.astype(np.int64))
+    return kept
+
+
+def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dropped: list[DroppedView], robust: bool) -> LensFit:
+    found = [camera.weight for camera in problem.cameras]
+    if robust:
+        # From px-wide tolerance inwards: the noise is unknown until most corners fit.
+        for _ in range(_ROBUST_ROUNDS):
+            scale = _noise(problem, state)
+            solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=12, tolerance=1e-6)
+            state = solution.x
+            used, problem, state, found = _judge_views(used, problem, state, found, dropped)
+        for _ in range(2):  # corners given up at the robust end may come back at the plain one
+            problem = _give_up_corners(problem, state, found)
+            solution = minimise(problem, state)
+            state = solution.x
+    else:
+        solution = minimise(problem, state)
+    names = ", ".join(views.camera for views in used)
+    for views, lens in zip(used, solution.x.lenses, strict=True):
+        if not np.all(np.isfinite(lens)) or lens[:2].min() <= 0:
+            raise NotConvergedError(f"{views.camera}: the solver left the lens model's domain: try another --model")
+    if not np.isfinite(solution.cost):
+        raise NotConvergedError(f"{names}: the solver found no minimum: check the target file, or try another --model")
+    observed = tuple(weight > 0 for weight in found)
+    return LensFit(tuple(used), problem, solution.x, solution.system, observed, tuple(dropped), solution.converged)
+
+
+def _normalised(problem: CameraProblem, state: LensState, c: int, weight: Array) -> tuple[Array, Mask]:
+    """Return |residual| in sigmas of camera c under the given weights, and where there is one."""
+    camera = replace(problem.cameras[c], weight=weight)
+    whole = replace(problem, cameras=(*problem.cameras[:c], camera, *problem.cameras[c + 1 :]))
+    r = whole.residuals(state, c)
+    return np.linalg.norm(r.px, axis=-1) * weight, r.seen
+
+
+def _noise(problem: CameraProblem, state: LensState) -> float:
+    norms = [z[seen] for z, seen in (_normalised(problem, state, c, v.weight) for c, v in enumerate(problem.cameras))]
+    return max(scale_of_norms(np.concatenate(norms)), 1e-9)
+
+
+def _judge_views(
+    used: list[BoardViews], problem: CameraProblem, state: LensState, found: list[Array], dropped: list[DroppedView]
+) -> tuple[list[BoardViews], CameraProblem, LensState, list[Array]]:
+    """Weigh noisy views down and give hopeless ones up."""
+    grids, kept_views, kept_found = [], [], []
+    for c, (views, grid) in enumerate(zip(used, problem.cameras, strict=True)):
+        z, seen = _normalised(problem, state, c, found[c])
+        scale = np.array([scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(z, seen, strict=True)])
+        typical = max(float(np.median(scale)), 1e-12)
+        good = scale <= _BAD_VIEW * typical
+        dropped += [
+            DroppedView(views.camera, views.labels[i], f"its corners fit {scale[i] / typical:.0f} times worse than usual")
+            for i in np.flatnonzero(~good)
+        ]
+        noisier = np.maximum(scale / (_NOISY_VIEW * typical), 1.0)[good]
+        grids.append(replace(_rows(grid, good), weight=found[c][good] / noisier[:, None]))
+        kept_views.append(views.select(good))
+        kept_found.append(found[c][good])
+    kept = _renumber(grids)
+    state = replace(state, T_cam0_board=state.T_cam0_board[kept])
+    return kept_views, replace(problem, cameras=tuple(grids)), state, kept_found
+
+
+def _give_up_corners(problem: CameraProblem, state: LensState, found: list[Array]) -> CameraProblem:
+    """Set the weight of corners beyond the outlier limit, or outside the model's domain, to 0; the others get theirs back."""
+    grids = []
+    for c, grid in enumerate(problem.cameras):
+        noisier = np.max(np.where(grid.weight > 0, found[c] / np.where(grid.weight > 0, grid.weight, 1.0), 0.0), axis=1, keepdims=True)
+        weight = found[c] / np.maximum(noisier, 1.0)
+        z, seen = _normalised(problem, state, c, weight)
+        limit = _OUTLIER * scale_of_norms(z[seen])
+        grids.append(replace(grid, weight=np.where(seen & (z <= limit), weight, 0.0)))
+    return replace(problem, cameras=tuple(grids))

@@ -1,0 +1,111 @@
+"""How far fitted lenses and camera positions may be trusted: covariance, what the views can tell, projection uncertainty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.estimation.camera_problem import CameraProblem, CameraViews
+from calibkit.estimation.lens_fit import LensFit
+from calibkit.geometry.so3 import Array, hat
+from calibkit.models.cameras import CameraModel
+from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
+
+_SAME_ORIENTATION = np.deg2rad(5.0)
+MIN_ORIENTATIONS = 3
+_GRID = (24, 16)
+
+
+def instant_times(fit: LensFit) -> Array:
+    """Return each instant's time in s from the first; without stamps every image counts as a second of its own."""
+    m = len(fit.state.T_cam0_board)
+    t = np.zeros(m, np.int64)
+    for views, camera in zip(fit.views, fit.problem.cameras, strict=True):
+        t[camera.instant] = views.t_ns
+    return (t - t.min()) * 1e-9 if t.any() else np.arange(m, dtype=float)
+
+
+def lens_covariance(fit: LensFit) -> Covariance:
+    """Return the covariance of the border (lenses, then T_cam_cam0 of camera 1, 2, ...), plain and corrected."""
+    S, scores = fit.problem.information(fit.state)
+    chi2, corners = 0.0, 0
+    for c, camera in enumerate(fit.problem.cameras):
+        r = fit.problem.residuals(fit.state, c)
+        chi2 += float(np.sum(r.px**2 * camera.weight[..., None] ** 2))
+        corners += int(np.sum(camera.weight > 0))
+    freedom = max(2 * corners - 6 * len(fit.state.T_cam0_board) - S.shape[-1], 1)
+    return covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, border_scales(fit.problem, fit.state.lenses))
+
+
+def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:
+    """Return what each border parameter must be known to: 1 px of focal length, centre and, at the image's edge, each coefficient."""
+    scales = np.empty(problem.border_size)
+    for views, lens, where in zip(problem.cameras, lenses, problem.lens_slices, strict=True):
+        width, height = views.image_size
+        x, y = np.meshgrid([0.0, (width - 1) / 2, width - 1.0], [0.0, (height - 1) / 2, height - 1.0])
+        rays, valid = views.model.unproject(np.stack([x.ravel(), y.ravel()], axis=-1), lens)
+        J = views.model.project(rays, lens, jacobians=True).J_params
+        assert J is not None
+        effect = np.max(np.linalg.norm(J[valid], axis=-2), axis=0) if valid.any() else np.ones(len(lens))
+        scales[where] = SCALES["px"] / np.maximum(effect, 1e-9)
+        scales[where][:4] = SCALES["px"]
+    for c in range(1, len(problem.cameras)):
+        scales[problem.rig_slice(c)] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
+    return scales
+
+
+@dataclass(frozen=True)
+class Orientations:
+    """How many different board orientations a camera saw."""
+
+    count: int  # directions of the board's normal that differ by 5 degrees or more
+    spread: float  # rad, the largest angle between two of them
+    tilt: float  # rad, the largest angle between the normal and the viewing direction
+
+
+def orientations(problem: CameraProblem, fit: LensFit, c: int) -> Orientations:
+    """Count the board's orientations: one plane's image fixes two of fx fy cx cy, a parallel plane adds nothing (Zhang 2000, 3.2)."""
+    normals = problem.residuals(fit.state, c).board_normal
+    cosine = normals @ normals.T
+    kept: list[int] = []
+    for i in range(len(normals)):
+        if all(cosine[i, k] < np.cos(_SAME_ORIENTATION) for k in kept):
+            kept.append(i)
+    tilt = np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)).max()
+    return Orientations(len(kept), float(np.arccos(np.clip(cosine.min(), -1, 1))), float(tilt))
+
+
+@dataclass(frozen=True)
+class ProjectionSigma:
+    """Uncertainty of projected far points over the image, the freedom of turning the whole camera taken out."""
+
+    uv: Array  # (g, 2) px
+    sigma: Array  # (g,) px, larger axis; NaN outside the model's domain
+    seen: NDArray[np.bool_]  # (g,) corners were observed in this cell
+
+
+def projection_sigma(views: CameraViews, lens: Array, cov_lens: Array) -> ProjectionSigma:
+    """Return sigma of the pixel of a far point where the lens is uncertain, as mrcal draws it (Kogan 2021).
+
+    du = J dlens + J_R phi, with phi the common rotation that best absorbs the first over the observed part of the image.
+    """
+    model: CameraModel = views.model
+    width, height = views.image_size
+    x, y = np.meshgrid((np.arange(_GRID[0]) + 0.5) * width / _GRID[0] - 0.5, (np.arange(_GRID[1]) + 0.5) * height / _GRID[1] - 0.5)
+    uv = np.stack([x.ravel(), y.ravel()], axis=-1)
+    observed = views.uv[views.weight > 0]
+    cell = np.clip((observed + 0.5) / [width, height] * _GRID, 0, np.array(_GRID) - 1).astype(int)
+    seen = np.zeros(_GRID[::-1], bool)
+    seen[cell[:, 1], cell[:, 0]] = True
+    rays, valid = model.unproject(uv, lens)
+    projection = model.project(rays, lens, jacobians=True)
+    assert projection.J_params is not None
+    assert projection.J_point is not None
+    J, J_R = projection.J_params, -projection.J_point @ hat(rays)
+    fit_at = seen.ravel() & valid if (seen.ravel() & valid).any() else valid
+    absorb = np.linalg.lstsq(J_R[fit_at].reshape(-1, 3), -J[fit_at].reshape(-1, J.shape[-1]), rcond=None)[0]
+    J = J + J_R @ absorb
+    cov = J @ cov_lens @ np.swapaxes(J, -1, -2)
+    sigma = np.full(len(uv), np.nan)
+    sigma[valid] = np.sqrt(np.maximum(np.linalg.eigvalsh(cov[valid])[:, -1], 0))
+    return ProjectionSigma(uv, sigma, seen.ravel())

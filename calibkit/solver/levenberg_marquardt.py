@@ -1,0 +1,65 @@
+"""One Levenberg-Marquardt driver for every problem (Marquardt 1963, damping after Nielsen 1999)."""
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from calibkit.solver.arrowhead import Array, Arrowhead
+
+X = TypeVar("X")
+
+_FIRST_DAMPING = 1e-4
+_MAX_DAMPING = 1e12
+
+
+class Problem(Protocol[X]):
+    """What a least-squares problem must answer."""
+
+    def linearize(self, x: X) -> tuple[float, Arrowhead]:
+        """Return the cost (robust r^T W r) and the normal equations at x."""
+        ...
+
+    def retract(self, x: X, core: Array, border: Array) -> X:
+        """Return x moved by the step of the nuisances (m, k) and of the calibration (p,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Solution(Generic[X]):
+    """Where the driver stopped."""
+
+    x: X
+    cost: float
+    system: Arrowhead  # at x
+    steps: int
+    converged: bool
+
+
+def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-11) -> Solution[X]:
+    """Return a local minimum of the problem's cost from x.
+
+    Converged when a step promises to lower the cost by less than `tolerance` of it. A cost that is not finite at the start
+    gives an unconverged solution; the caller names the cause.
+    """
+    cost, system = problem.linearize(x)
+    damping, growth = _FIRST_DAMPING, 2.0
+    for steps in range(max_steps):
+        if not np.isfinite(cost) or damping > _MAX_DAMPING:
+            return Solution(x, cost, system, steps, False)
+        try:
+            core, border, promised = system.step(damping)
+        except np.linalg.LinAlgError:
+            damping, growth = damping * growth, growth * 2
+            continue
+        if promised <= tolerance * cost:
+            return Solution(x, cost, system, steps, True)
+        trial = problem.retract(x, core, border)
+        trial_cost, trial_system = problem.linearize(trial)
+        gain = (cost - trial_cost) / promised
+        if gain > 0 and np.isfinite(trial_cost):
+            x, cost, system = trial, trial_cost, trial_system
+            damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
+        else:
+            damping, growth = damping * growth, growth * 2
+    return Solution(x, cost, system, max_steps, False)

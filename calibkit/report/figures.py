@@ -1,0 +1,202 @@
+"""The pictures of a report as a table: what each needs, how it is drawn, and what to look for (the only matplotlib user).
+
+A new picture is one function (Figure, View) and one line in PICTURES. Dark on white, told apart by shape as well as by colour.
+"""
+
+import io
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import floor, log10
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from calibkit.report.field import cells, grid, over_image, over_radius
+from calibkit.report.signals import frame_tilts
+from calibkit.report.view import View, given
+
+INK, ACCENT, PALE = "#1f3b57", "#c1440e", "#9fb3c8"
+MAX_BARS = 60
+STYLE: dict[Any, Any] = {
+    "svg.hashsalt": "calibkit",  # ids that do not change from run to run
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9,
+    "axes.axisbelow": True,
+    "text.parse_math": False,  # names come from files: a $ in them is a $
+}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One kind of picture."""
+
+    key: str
+    title: str
+    caption: str
+    needs: frozenset[str]
+    height: float  # inches
+    draw: Callable[[Figure, View], None]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A picture of one view."""
+
+    picture: Picture
+    view: View
+    svg: bytes
+    png: bytes
+
+
+def draw(view: View) -> list[Drawn]:
+    """Return every picture that the view has the data for, in the table's order; the same view gives the same bytes."""
+    return [_render(picture, view) for picture in PICTURES if view.has(picture.needs)]
+
+
+def _render(picture: Picture, view: View) -> Drawn:
+    # From the defaults up: a user's own matplotlibrc would change the bytes. No backend is chosen: Figure draws on its own.
+    defaults: dict[Any, Any] = {key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith("backend")}
+    with matplotlib.rc_context(defaults | STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in a script that the font lacks
+        figure = Figure(figsize=(9, picture.height), layout="constrained")
+        picture.draw(figure, view)
+        svg, png = io.BytesIO(), io.BytesIO()
+        figure.savefig(svg, format="svg", dpi=130, metadata={"Date": None, "Creator": "calibkit"})
+        figure.savefig(png, format="png", dpi=130, metadata={"Software": "calibkit"})
+    return Drawn(picture, view, svg.getvalue(), png.getvalue())
+
+
+def _scatter(figure: Figure, view: View) -> None:
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
+    kept, dropped = view.raw[view.kept], view.raw[~view.kept]
+    sigma = float(np.sqrt(np.mean(kept**2)))
+    reach = 5 * sigma if sigma > 0 else 1.0
+    left.plot(*kept.T, ".", color=INK, ms=2.5, alpha=float(np.clip(3000 / len(kept), 0.15, 0.7)), mew=0, rasterized=True)
+    near = dropped[np.all(np.abs(dropped) < reach, axis=1)]
+    left.plot(*near.T, "x", color=ACCENT, ms=4, rasterized=True)
+    for k in (1, 2, 3):
+        turn = np.linspace(0, 2 * np.pi, 100)
+        left.plot(k * sigma * np.cos(turn), k * sigma * np.sin(turn), color="black", lw=0.7, ls=(0, (4, 3)))
+    left.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel=f"du ({view.unit})", ylabel=f"dv ({view.unit})")
+    outside = len(dropped) - len(near)
+    note = f"× dropped{f' ({outside} more outside)' if outside else ''}" if len(dropped) else "none dropped"
+    left.set_title(f"kept corners, circles at 1, 2, 3 sigma; {note}")
+    bins = np.linspace(-reach, reach, 61)
+    x = np.linspace(-reach, reach, 200)
+    for values, name, line, fill in ((kept[:, 0], "du", "-", PALE), (kept[:, 1], "dv", "--", None)):
+        right.hist(values, bins, density=True, histtype="stepfilled" if fill else "step", color=fill or INK, ls=line, lw=1.2, label=name)
+    if sigma > 0:
+        normal = np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+        right.plot(x, normal, color=ACCENT, lw=1.4, label="normal")
+    right.set(xlabel=f"residual ({view.unit})", xlim=(-reach, reach), yticks=[])
+    right.set_title(f"sigma {sigma:.3g} {view.unit} a coordinate, mean ({kept[:, 0].mean():+.2g}, {kept[:, 1].mean():+.2g})")
+    right.legend(frameon=False)
+
+
+def _field(figure: Figure, view: View) -> None:
+    width, height = given(view.image_size)
+    left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
+    found, (columns, rows) = over_image(view)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) * width / columns - 0.5, (np.arange(rows) + 0.5) * height / rows - 0.5)
+    seen = np.all(np.isfinite(found.sigma), axis=1)
+    sure = seen & (np.linalg.norm(found.mean, axis=1) > 3 * np.linalg.norm(np.nan_to_num(found.sigma), axis=1))
+    longest = float(np.max(np.linalg.norm(found.mean[seen], axis=1), initial=0))
+    scale = (longest or 1.0) / (1.1 * width / columns)  # px of residual per px of image
+    for chosen, colour in ((seen & ~sure, PALE), (sure, INK)):
+        at = x.ravel()[chosen], y.ravel()[chosen]
+        arrows = left.quiver(*at, *found.mean[chosen].T, angles="xy", scale_units="xy", scale=scale, color=colour, width=0.004, pivot="mid")
+    key = _round_down(longest) if longest > 0 else 1.0
+    left.quiverkey(arrows, 0.92, -0.13, key, f"{key:g} {view.unit}", labelpos="W", color=INK)
+    left.plot(*given(view.centre), "+", color=ACCENT, ms=9)
+    _frame_image(left, view)
+    left.set_title("mean residual of each cell; dark: beyond 3 sigma of zero")
+    radial, tangential, edges = over_radius(view)
+    middle = (edges[1:] + edges[:-1]) / 2
+    lines = ((radial, "radial (outwards)", "o-", INK, -0.06), (tangential, "tangential", "s--", ACCENT, 0.06))
+    for part, name, mark, colour, shift in lines:
+        some = np.isfinite(part.sigma[:, 0])
+        at = middle[some] + shift * (edges[1] - edges[0])
+        right.errorbar(at, part.mean[some, 0], 2 * part.sigma[some, 0], fmt=mark, color=colour, ms=4, lw=1, capsize=2, label=name)
+    right.axhline(0, color="black", lw=0.7)
+    right.set(xlabel="distance from the principal point (px)", ylabel=f"mean residual ({view.unit})", title="by distance, bars of 2 sigma")
+    right.legend(frameon=False)
+
+
+def _coverage(figure: Figure, view: View) -> None:
+    width, height = size = given(view.image_size)
+    columns, rows = grid(size)
+    both = view.has(frozenset({"tilt", "frame"})) and len(frame_tilts(view)) > 0
+    axes = figure.subplots(1, 2 if both else 1, width_ratios=[1.7, 1] if both else None, squeeze=False)[0]
+    counts = np.bincount(cells(given(view.uv)[view.kept], size, (columns, rows)), minlength=columns * rows).reshape(rows, columns)
+    axes[0].imshow(np.sqrt(counts), cmap="Greys", vmin=0, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal")
+    for row, column in np.ndindex(rows, columns):
+        many = np.sqrt(counts[row, column]) > 0.6 * np.sqrt(counts.max())
+        text, colour = (str(counts[row, column]), "white" if many else "black") if counts[row, column] else ("–", ACCENT)
+        at = (column + 0.5) * width / columns, (row + 0.5) * height / rows
+        axes[0].text(*at, text, color=colour, ha="center", va="center", fontsize=7)
+    _frame_image(axes[0], view)
+    axes[0].set_title("kept corners in each cell of the image")
+    if both:
+        axes[1].hist(np.degrees(frame_tilts(view)), np.arange(0, 91, 5), color=PALE, edgecolor=INK)
+        axes[1].set(xlabel="tilt of the board (deg)", ylabel="frames", title="how the boards were tilted")
+        axes[1].yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _frames(figure: Figure, view: View) -> None:
+    axes = figure.subplots()
+    values = view.frame_rms
+    n = len(values)
+    worst = np.argsort(np.where(np.isfinite(values), -values, np.inf), kind="stable")[: min(3, n)]
+    if n <= MAX_BARS:
+        bars = axes.bar(np.arange(n), np.nan_to_num(values), color=PALE, edgecolor=INK, lw=0.5)
+        for i in worst:
+            bars[i].set(facecolor=ACCENT, hatch="///")
+    else:
+        axes.plot(np.arange(n), values, color=INK, lw=0.8)
+        axes.plot(worst, values[worst], "x", color=ACCENT, ms=7, mew=2)
+    middle = float(np.nanmedian(values))
+    axes.axhline(middle, color="black", lw=0.8, ls="--")
+    axes.set(xlabel="frame, in the order of the recording", ylabel=f"rms ({view.unit})", xlim=(-0.7, n - 0.3), ylim=(0, None))
+    named = ", ".join(f"{view.labels[i]} ({values[i]:.3g})" for i in worst if np.isfinite(values[i]))
+    axes.set_title(f"median {middle:.3g} {view.unit} (dashed); worst: {named}")
+
+
+def _frame_image(axes: Axes, view: View) -> None:
+    width, height = given(view.image_size)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    axes.spines[:].set_visible(True)
+
+
+def _round_down(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above value."""
+    power = 10.0 ** floor(log10(value))
+    return max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-12))
+
+
+_PIXELS = frozenset({"uv"})
+_IMAGE = frozenset({"uv", "frame", "image_size", "centre"})
+PICTURES = (
+    Picture("scatter", "Residual scatter",
+            "A round cloud around zero and histograms that follow the normal curve are good; an off-centre, stretched or heavy-tailed "
+            "cloud is not noise.",
+            _PIXELS, 3.9, _scatter),
+    Picture("field", "Residual field over the image",
+            "Pale arrows in random directions are good; dark arrows that form a swirl, a ring or a stream are what the lens model "
+            "leaves over.",
+            _IMAGE, 3.6, _field),
+    Picture("coverage", "Coverage of the image and of tilt",
+            "Every cell should hold corners and the tilts should reach past 30 deg; where a cell shows a dash, the lens is extrapolated.",
+            _PIXELS | {"image_size"}, 3.4, _coverage),
+    Picture("frames", "Rms of each frame",
+            "Bars of about one height are good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or mount "
+            "that drifts.",
+            _PIXELS | {"frame"}, 2.6, _frames),
+)  # fmt: skip

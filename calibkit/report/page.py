@@ -1,0 +1,61 @@
+"""The report's files: one self-contained HTML page, its pictures as PNG, and report.json; the same input gives the same bytes."""
+
+import base64
+import json
+import re
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from calibkit.data.rig import CONVENTIONS
+from calibkit.data.verdict import Verdict
+from calibkit.errors import one_line
+from calibkit.report.figures import draw
+from calibkit.report.summary import Summary, as_json
+from calibkit.version import __version__
+
+MEANING = {
+    Verdict.PASS: "use it",
+    Verdict.CHECK: "usable, but read the reasons",
+    Verdict.FAIL: "do not use it",
+}
+
+
+def build(summary: Summary) -> dict[str, bytes]:
+    """Return the report's files by name: report.html, report.json and the pictures."""
+    sections, images, pictures = [], {}, []
+    for view in summary.views:
+        drawn = draw(view)
+        for one in drawn:
+            name = _slug(view.sensor, view.stage, one.picture.key) + ".png"
+            images[name] = one.png
+            what = {"sensor": view.sensor, "stage": view.stage, "key": one.picture.key, "caption": one.picture.caption}
+            pictures.append({"file": name, **what})
+        sections.append((view, [(one.picture, _data_uri("image/svg+xml", one.svg)) for one in drawn]))
+    thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
+    page = _template().render(
+        summary=summary,
+        meaning=MEANING[summary.verdict],
+        sections=sections,
+        thumbnails=thumbnails,
+        conventions=CONVENTIONS,
+        version=__version__,
+    )
+    data = json.dumps(as_json(summary, pictures), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return {**images, "report.html": page.encode(), "report.json": data.encode()}  # in the order of writing: what points to others last
+
+
+def _template() -> Template:
+    # Names of topics and files are a stranger's text: everything is escaped but what is marked safe here.
+    loader = PackageLoader("calibkit.report")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["line"] = lambda value: one_line(value, 1000)
+    return environment.get_template("report.html")
+
+
+def _data_uri(mime: str, data: bytes) -> Markup:
+    return Markup(f"data:{mime};base64,{base64.b64encode(data).decode()}")  # base64 has nothing to escape
+
+
+def _slug(*parts: str) -> str:
+    return "-".join(re.sub(r"[^A-Za-z0-9_]", "_", part)[:60] for part in parts)

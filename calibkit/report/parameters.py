@@ -1,0 +1,126 @@
+"""Every number of a rig as one table: value, sigma, status, whatever part of the rig it belongs to."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import degrees, floor, log10
+
+import numpy as np
+
+from calibkit.data.rig import Camera, Estimate, Imu, Rig, TimeOffset, Transform
+from calibkit.data.verdict import Reason, Status, Verdict, worst
+from calibkit.geometry import so3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter of one part of the rig (cam0, T_cam1_cam0, ...)."""
+
+    part: str
+    name: str
+    value: float | None
+    sigma: float | None
+    sigma_plain: float | None
+    unit: str
+    status: Status
+    note: str = ""
+
+    @property
+    def factor(self) -> float | None:
+        """How much larger the corrected sigma is than the one for white residuals."""
+        return self.sigma / self.sigma_plain if self.sigma is not None and self.sigma_plain else None
+
+    @property
+    def value_text(self) -> str:
+        """The value to two digits of its sigma, else as it was given."""
+        if self.value is None:
+            return "not observable"
+        return f"{self.value:.9g}" if not self.sigma else f"{self.value:.{_decimals(self.sigma)}f}"
+
+    @property
+    def sigma_text(self) -> str:
+        return "" if self.sigma is None else number(self.sigma)
+
+    @property
+    def sigma_plain_text(self) -> str:
+        return "" if self.sigma_plain is None else number(self.sigma_plain)
+
+    @property
+    def factor_text(self) -> str:
+        return "" if self.factor is None else f"{self.factor:.2f}"
+
+
+def _decimals(sigma: float) -> int:
+    return min(max(0, 1 - floor(log10(sigma))), 12)
+
+
+def number(value: float) -> str:
+    """Return a sigma in two digits, plain where that is short."""
+    return f"{value:.{_decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}"
+
+
+def parts(rig: Rig) -> dict[str, Camera | Transform | TimeOffset]:
+    """Return what of the rig carries a verdict, by name."""
+    return {**rig.cameras, **rig.transforms, **rig.time_offsets}
+
+
+def rows(rig: Rig) -> list[Row]:
+    """Return all parameters of the rig: cameras, transforms, time offsets, IMUs."""
+    out = [_row(name, key, estimate) for name, camera in rig.cameras.items() for key, estimate in camera.parameters.items()]
+    for name, transform in rig.transforms.items():
+        out += _transform_rows(name, transform)
+    out += [_row(name, "offset", entry.offset, entry.equation) for name, entry in rig.time_offsets.items()]
+    for name, imu in rig.imus.items():
+        for key in Imu.model_fields:
+            estimate = getattr(imu, key)
+            if isinstance(estimate, Estimate):
+                out.append(_row(name, key, estimate))
+    return out
+
+
+def _row(part: str, name: str, estimate: Estimate, note: str = "") -> Row:
+    return Row(part, name, estimate.value, estimate.sigma, estimate.sigma_plain, estimate.unit, estimate.status, note)
+
+
+def _transform_rows(name: str, transform: Transform) -> Iterator[Row]:
+    """Yield translation and rotation vector; the covariance in b's frame turned into a: p_a moves by R rho."""
+    T = np.array(transform.matrix)
+    known = transform.status is not Status.NOT_OBSERVABLE
+    sigma: list[float | None] = [None] * 6
+    if transform.covariance is not None and transform.covariance.order == ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]:
+        cov = np.array(transform.covariance.matrix)
+        in_a = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T
+        sigma = [float(v) for v in np.sqrt(np.maximum([*np.diag(in_a), *np.diag(cov)[3:]], 0))]
+    vector = so3.log(T[:3, :3])
+    for i, axis in enumerate("xyz"):
+        yield Row(name, f"p_{axis}", float(T[i, 3]) if known else None, sigma[i] if known else None, None, "m", transform.status)
+    for i, axis in enumerate("xyz"):
+        value = float(vector[i])
+        yield Row(
+            name,
+            f"rotation vector {axis}",
+            value if known else None,
+            sigma[3 + i] if known else None,
+            None,
+            "rad",
+            transform.status,
+            f"{degrees(value):.4f} deg" if known else "",
+        )
+
+
+def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
+    """Return what the rig file says against its own parts beyond the `known` reasons: stored verdicts, and parameters not observable."""
+    heard = {reason.text for reason in known}
+    out = []
+    for part, entry in parts(rig).items():
+        if entry.verdict is None:
+            continue
+        texts = [text for text in entry.reasons if text not in heard]
+        out += [Reason(entry.verdict, f"{part}: {text}") for text in texts if f"{part}: {text}" not in heard]
+        if not entry.reasons and entry.verdict is not Verdict.PASS and worst(known) is Verdict.PASS:
+            out.append(Reason(entry.verdict, f"{part}: its stage judged it {entry.verdict.value}"))
+    gone: dict[str, list[str]] = {}
+    for row in rows(rig):
+        if row.status is Status.NOT_OBSERVABLE:
+            gone.setdefault(row.part, []).append(row.name)
+    out += [Reason(Verdict.FAIL, f"{part}: not observable in this recording: {', '.join(names)}") for part, names in gone.items()]
+    return tuple(out)

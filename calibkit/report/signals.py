@@ -1,0 +1,213 @@
+"""The signals of a residual set as a table: what is measured, what is good, what is bad (numpy only).
+
+A new signal is one function View -> Measured and one line in PROBES.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from math import inf, isfinite
+
+import numpy as np
+
+from calibkit.data.result import Result
+from calibkit.data.verdict import Reason, Verdict
+from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
+from calibkit.report.view import Array, View, given, rms, views
+
+SIGNIFICANT = 4.0  # sigma below which structure is taken for chance
+COVERAGE_GRID = (8, 6)
+MIN_CORNERS = 3  # in a cell that counts as covered
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A value in its probe's unit and what there is to say about it; `exempt` when the value tells nothing (too few data, chance)."""
+
+    value: float
+    note: str = ""
+    exempt: bool = False
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One signal: PASS up to `good`, CHECK up to `bad`, FAIL beyond (the other way round where bad < good)."""
+
+    key: str
+    title: str
+    unit: str
+    good: float
+    bad: float
+    needs: frozenset[str]
+    measure: Callable[[View], Measured]
+    means: str  # what it says when it is not good, and the remedy
+
+    def judge(self, value: float) -> Verdict:
+        sign = 1 if self.bad >= self.good else -1
+        if sign * value <= sign * self.good:
+            return Verdict.PASS
+        return Verdict.CHECK if sign * value <= sign * self.bad else Verdict.FAIL
+
+    @property
+    def limit(self) -> str:
+        """What is good, and beyond which it fails, as people read it."""
+        below, above = ("≤", ">") if self.bad >= self.good else ("≥", "<")
+        unit = f" {self.unit}" if self.unit else ""
+        good = f"{below} {self.good:g}{unit}"
+        return f"{good} (FAIL {above} {self.bad:g}{unit})" if isfinite(self.bad) else good
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What a probe found in one sensor's residuals."""
+
+    probe: Probe
+    stage: str
+    sensor: str
+    value: float
+    note: str
+    verdict: Verdict
+
+    @property
+    def reason(self) -> Reason:
+        """The signal as a sentence of a verdict."""
+        unit = f" {self.probe.unit}" if self.probe.unit else ""
+        note = f" ({self.note})" if self.note else ""
+        means = "" if self.verdict is Verdict.PASS else f": {self.probe.means}"
+        return Reason(self.verdict, f"{self.sensor}: {self.probe.title} {self.value:.3g}{unit}{note}, good is {self.probe.limit}{means}")
+
+
+def measure(view: View) -> list[Signal]:
+    """Return every signal that the view has the data for, in the table's order."""
+    found = []
+    for probe in PROBES:
+        if not view.has(probe.needs):
+            continue
+        measured = probe.measure(view)
+        if isfinite(measured.value):
+            verdict = Verdict.PASS if measured.exempt else probe.judge(measured.value)
+            found.append(Signal(probe, view.stage, view.sensor, measured.value, measured.note, verdict))
+    return found
+
+
+def reasons(result: Result) -> tuple[Reason, ...]:
+    """Return one sentence for each signal of the result that is not good: for a stage's own verdict."""
+    return not_good(signal for view in views(result) for signal in measure(view))
+
+
+def not_good(signals: Iterable[Signal]) -> tuple[Reason, ...]:
+    """Return the sentences of the signals that are not good."""
+    return tuple(signal.reason for signal in signals if signal.verdict is not Verdict.PASS)
+
+
+def _rms(view: View) -> Measured:
+    every = rms(view.raw)
+    return Measured(rms(view.raw[view.kept]), f"{every:.3g} {view.unit} with the dropped corners")
+
+
+def _held_out(view: View) -> Measured:
+    held_out = given(view.held_out_rms)
+    ratio = held_out / max(rms(view.raw[view.kept]), 1e-12)
+    return Measured(ratio, f"{held_out:.3g} px on frames that the solver did not see")
+
+
+def _dropped(view: View) -> Measured:
+    total = len(view.raw) + view.n_lost
+    dropped = total - int(view.kept.sum())
+    return Measured(100 * dropped / total, f"{dropped} of {total} corners")
+
+
+def _worst_frame(view: View) -> Measured:
+    per_frame = view.frame_rms
+    some = np.isfinite(per_frame)
+    worst = int(np.argmax(np.where(some, per_frame, -1)))
+    middle = float(np.median(per_frame[some]))
+    note = f"{view.labels[worst]}: {per_frame[worst]:.3g} {view.unit}, median {middle:.3g}"
+    return Measured(float(per_frame[worst]) / max(middle, 1e-12), note, exempt=some.sum() < 3)
+
+
+def _structure(found: Repeating, view: View) -> Measured:
+    share = 100 * found.size**2 / max(rms(view.raw[view.kept]) ** 2, 1e-24)
+    if found.significance < SIGNIFICANT:
+        return Measured(found.size, "no more than chance", exempt=True)
+    return Measured(found.size, f"{share:.0f} % of the variance")
+
+
+def _field(view: View) -> Measured:
+    return _structure(over_image(view)[0], view)
+
+
+def _radial(view: View) -> Measured:
+    return _structure(over_radius(view)[0], view)
+
+
+def _swirl(view: View) -> Measured:
+    return _structure(over_radius(view)[1], view)
+
+
+def _neighbours(view: View) -> Measured:
+    rho, pairs = neighbour_correlation(view)
+    chance = abs(rho) * np.sqrt(2 * pairs) < SIGNIFICANT
+    return Measured(rho, f"{pairs} pairs{', chance' if chance else ''}", exempt=bool(chance))
+
+
+def _coverage(view: View) -> Measured:
+    cell = cells(given(view.uv)[view.kept], given(view.image_size), COVERAGE_GRID)
+    counts = np.bincount(cell, minlength=COVERAGE_GRID[0] * COVERAGE_GRID[1])
+    empty = empty_regions(view)
+    return Measured(100 * float(np.mean(counts >= MIN_CORNERS)), f"no corners {', '.join(empty)}" if empty else "")
+
+
+REGIONS = (
+    ("in the upper left", "at the top", "in the upper right"),
+    ("on the left", "in the middle", "on the right"),
+    ("in the lower left", "at the bottom", "in the lower right"),
+)
+
+
+def empty_regions(view: View) -> list[str]:
+    """Name the ninths of the image that hold fewer than MIN_CORNERS kept corners."""
+    counts = np.bincount(cells(given(view.uv)[view.kept], given(view.image_size), (3, 3)), minlength=9)
+    names = [name for row in REGIONS for name in row]
+    return [name for name, count in zip(names, counts, strict=True) if count < MIN_CORNERS]
+
+
+def frame_tilts(view: View) -> Array:
+    """Return the board's tilt (rad) in each frame that has kept corners."""
+    tilt = given(view.tilt)
+    rows = np.flatnonzero(view.kept & np.isfinite(tilt))
+    _, first = np.unique(given(view.frame)[rows], return_index=True)
+    return tilt[rows[first]]
+
+
+def _tilt(view: View) -> Measured:
+    tilts = np.degrees(frame_tilts(view))
+    if not len(tilts):
+        return Measured(float("nan"))
+    low, high = np.percentile(tilts, [10, 90])
+    return Measured(float(high), f"most boards between {low:.0f} and {high:.0f} deg")
+
+
+_PIXELS = frozenset({"uv", "frame"})
+_IMAGE = _PIXELS | {"image_size"}
+PROBES = (
+    Probe("reprojection_rms", "reprojection rms", "px", 0.3, 1.0, frozenset({"uv"}), _rms,
+          "corners are met badly: look for blur, a wrong board size or a wrong camera model"),
+    Probe("held_out_ratio", "held-out rms over rms", "", 1.3, 3.0, frozenset({"uv", "held_out_rms"}), _held_out,
+          "the model fits the frames it saw better than others: record more, and more varied, boards"),
+    Probe("dropped_corners", "corners dropped", "%", 5, 30, frozenset({"uv"}), _dropped,
+          "many corners disagree with the rest: look at the worst frames"),
+    Probe("worst_frame_ratio", "worst frame over the median frame", "", 3, inf, _PIXELS, _worst_frame,
+          "look at that frame: blur, a wrong board, a bent board"),
+    Probe("field", "residual that repeats over the image", "px", 0.1, 0.5, _IMAGE, _field,
+          "the lens model does not fit this lens: try another --model"),
+    Probe("radial_field", "radial part of it", "px", 0.1, 0.5, _PIXELS | {"centre"}, _radial,
+          "a radial pattern is left: the lens needs more radial coefficients or another --model"),
+    Probe("tangential_field", "swirl around the centre", "px", 0.1, 0.5, _PIXELS | {"centre"}, _swirl,
+          "a swirl is left: a shifted sensor, a rolling shutter or a twisted board"),
+    Probe("neighbour_correlation", "correlation of neighbouring corners", "", 0.2, inf, _PIXELS | {"corner"}, _neighbours,
+          "neighbours share their error, so plain sigmas are too small: believe the corrected ones"),
+    Probe("image_coverage", "image covered by corners", "%", 60, -inf, frozenset({"uv", "image_size"}), _coverage,
+          "the lens is extrapolated where no corner was: bring the board there"),
+    Probe("tilt_range", "tilt of the boards (90th percentile)", "deg", 20, -inf, frozenset({"tilt", "frame"}), _tilt,
+          "boards facing the camera leave focal length and distance coupled: tilt the board by 30 to 45 deg"),
+)  # fmt: skip

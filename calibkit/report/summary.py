@@ -1,0 +1,128 @@
+"""What a report says, before it is drawn: the verdict with its reasons, the parameter table and the signals; as text and as JSON."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+from calibkit.data.result import Result
+from calibkit.data.rig import Rig
+from calibkit.data.verdict import Reason, Verdict, worst
+from calibkit.errors import one_line
+from calibkit.report.parameters import Row, parts, rig_reasons, rows
+from calibkit.report.signals import Signal, measure, not_good
+from calibkit.report.view import View, views
+
+SCHEMA = "calibkit-report/1"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The words and numbers of a report of one rig."""
+
+    rig: Rig
+    results: tuple[Result, ...]
+    reasons: tuple[Reason, ...]  # gravest first
+    parameters: tuple[Row, ...]
+    views: tuple[View, ...]
+    signals: tuple[Signal, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        return worst(self.reasons)
+
+
+def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
+    """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once."""
+    seen = tuple(view for result in results for view in views(result))
+    signals = tuple(signal for view in seen for signal in measure(view))
+    said = tuple(reason for result in results for reason in result.reasons)
+    said += rig_reasons(rig, said)
+    gone = [name for result in results for name in result.not_observable]
+    unsaid = [name for name in gone if not any(name in reason.text for reason in said)]
+    said += tuple(Reason(Verdict.FAIL, f"not observable in this recording: {name}") for name in unsaid)
+    said += not_good(signals)
+    if not said:
+        judged = any(part.verdict for part in parts(rig).values())
+        text = "nothing speaks against it" if judged else "no stage of calibkit has judged this rig: its numbers were given, not estimated"
+        said = (Reason(Verdict.PASS if judged else Verdict.CHECK, text),)
+    order = list(Verdict)
+    unique = sorted(dict.fromkeys(said), key=lambda reason: -order.index(reason.verdict))
+    return Summary(rig, tuple(results), tuple(unique), tuple(rows(rig)), seen, signals)
+
+
+def text(summary: Summary) -> str:
+    """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
+    lines = [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
+    if summary.signals:
+        head = [("sensor", "signal", "measured", "good", "")]
+        lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))
+    lines.append(f"{summary.verdict.value}")
+    lines += [f"  {reason.verdict.value:5} {one_line(reason.text, 1000)}" for reason in summary.reasons]
+    return "\n".join(lines)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    status = row.status.value + (f" ({row.note})" if row.note else "")
+    return (f"{row.part} {row.name}", row.value_text, row.sigma_text, row.sigma_plain_text, row.factor_text, row.unit, status)
+
+
+def _signal_cells(signal: Signal) -> tuple[str, ...]:
+    unit = f" {signal.probe.unit}" if signal.probe.unit else ""
+    return (signal.sensor, signal.probe.title, f"{signal.value:.3g}{unit}", signal.probe.limit, signal.verdict.value)
+
+
+def _table(cells: Sequence[Sequence[str]]) -> str:
+    clean = [[one_line(cell, 80) for cell in row] for row in cells]
+    widths = [max(len(cell) for cell in column) for column in zip(*clean, strict=True)]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in clean) + "\n"
+
+
+def as_json(summary: Summary, pictures: Sequence[dict[str, str]] = ()) -> dict[str, object]:
+    """Return the report for machines, schema calibkit-report/1: SI units and px, null where nothing is known, names as in the rig file.
+
+    Keys are added, never renamed, within a version.
+    """
+    return {
+        "schema": SCHEMA,
+        "verdict": summary.verdict.value,
+        "reasons": [{"verdict": reason.verdict.value, "text": reason.text} for reason in summary.reasons],
+        "not_observable": [f"{row.part}.{row.name}" for row in summary.parameters if row.value is None],
+        "parameters": [
+            {
+                "part": row.part,
+                "name": row.name,
+                "value": row.value,
+                "sigma": row.sigma,
+                "sigma_plain": row.sigma_plain,
+                "sigma_factor": row.factor,
+                "unit": row.unit,
+                "status": row.status.value,
+            }
+            for row in summary.parameters
+        ],
+        "signals": [
+            {
+                "sensor": signal.sensor,
+                "stage": signal.stage,
+                "key": signal.probe.key,
+                "title": signal.probe.title,
+                "value": signal.value,
+                "unit": signal.probe.unit,
+                "good": signal.probe.good,
+                "fail": signal.probe.bad if isfinite(signal.probe.bad) else None,
+                "smaller_is_better": signal.probe.bad >= signal.probe.good,
+                "verdict": signal.verdict.value,
+                "note": signal.note,
+            }
+            for signal in summary.signals
+        ],
+        "frames": [
+            {"sensor": view.sensor, "stage": view.stage, "unit": view.unit, "label": label, "rms": float(rms) if isfinite(rms) else None}
+            for view in summary.views
+            if view.frame is not None
+            for label, rms in zip(view.labels, view.frame_rms, strict=True)
+        ],
+        "facts": {result.stage: result.facts for result in summary.results},
+        "pictures": list(pictures),
+        "provenance": [run.model_dump(mode="json") for run in summary.rig.provenance],
+    }

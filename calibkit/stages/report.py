@@ -1,0 +1,67 @@
+"""The report of any result: from the stage that just made it, or later from the rig file and its residual files, without the recording."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from calibkit.data.result import Result
+from calibkit.data.rig import Rig, StageRun
+from calibkit.errors import BadInputError, one_line
+from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.residual_file import load_result
+from calibkit.io.rig_file import load_rig
+from calibkit.report.summary import Summary, as_json, summarise
+
+FILES = ("report.html", "report.json")
+
+
+def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None = None, force: bool = False) -> Summary:
+    """Judge a rig file by its own verdicts and its residual files, and write the report where one is asked for.
+
+    BadInputError, with nothing written, for a missing or changed file and for outputs that exist already.
+    """
+    if out_dir is not None:
+        check_out_dir(out_dir, force)
+    if json_path is not None:
+        refuse_existing(json_path, force)
+    rig = load_rig(rig_path)
+    results = [load_result(rig_path, rig, run) for run in _latest_runs(rig)]
+    summary = summarise(rig, results)
+    if out_dir is not None:
+        _write_pages(summary, out_dir)
+    if json_path is not None:
+        write_atomic(json_path, json.dumps(as_json(summary), indent=1, ensure_ascii=False, allow_nan=False) + "\n", overwrite=force)
+    return summary
+
+
+def write_report(result: Result, out_dir: Path, force: bool = False) -> Summary:
+    """Write the report of one stage's result: for every stage's `--report DIR`."""
+    check_out_dir(out_dir, force)
+    summary = summarise(result.rig, [result])
+    _write_pages(summary, out_dir)
+    return summary
+
+
+def check_out_dir(out_dir: Path, force: bool = False) -> None:
+    """Raise BadInputError where a report cannot be written into `out_dir`: to be asked before long work, too."""
+    if out_dir.exists() and not out_dir.is_dir():
+        raise BadInputError(f"{one_line(out_dir)}: is a file; give the name of a folder for the report")
+    for name in FILES:
+        refuse_existing(out_dir / name, force)
+
+
+def _latest_runs(rig: Rig) -> list[StageRun]:
+    """Return the runs whose residual files the rig still stands for: a later run of the same stage has replaced the earlier one's file."""
+    return list({run.residual_file: run for run in rig.provenance if run.residual_file is not None}.values())
+
+
+def _write_pages(summary: Summary, out_dir: Path) -> None:
+    from calibkit.report.page import build  # matplotlib and jinja2: not needed where only the verdict is asked for
+
+    files: Mapping[str, bytes] = build(summary)
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(f"{one_line(out_dir)}: cannot be made ({one_line(error.strerror or error)}); choose another folder") from None
+    for name, content in files.items():
+        write_atomic(out_dir / name, content, overwrite=True)

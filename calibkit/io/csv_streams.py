@@ -73,10 +73,11 @@ class _Table(NamedTuple):
         """Return the time column in ns, exactly; its unit is the header's, else what the first value's size means, else s."""
         texts = [line.split(self.delimiter)[self.columns["t"]].strip() for line in self.lines]
         try:
-            values = [Decimal(text) for text in texts]
             first = stamp_ns(texts[0])
-            unit = _TIME_UNITS.get(self.units["t"]) or (round(first / values[0]) if first else 10**9)
-            return np.array([int(value * unit) for value in values], np.int64)
+            unit = _TIME_UNITS.get(self.units["t"]) or (round(first / Decimal(texts[0])) if first else 10**9)
+            if all(map(str.isdecimal, texts)):
+                return np.array(list(map(int, texts)), np.int64) * unit
+            return np.array([int(Decimal(text) * unit) for text in texts], np.int64)
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise BadInputError(f"{self.name}: its time column must hold numbers of ns, us, ms or s ({one_line(error, 80)})") from error
 
@@ -176,7 +177,7 @@ def csv_source(path: Path, name: str) -> Source:
         t_ns = _table(path, name, source.warn).times()
         if kind == "corners":
             t_ns = t_ns[np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))]  # one stamp a frame, not one a corner
-        return {name: Stamps(t_ns, t_ns)}
+        return {name: Stamps(None, t_ns)}
 
     source.survey = survey
     return source

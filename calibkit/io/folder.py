@@ -86,7 +86,7 @@ def _add_images(source: Source, topic: str, kind: str, frames: list[tuple[int, P
     source.images[topic] = partial(_frames, source.name, frames)
 
     def survey(progress: Progress) -> dict[str, Stamps]:
-        return {topic: Stamps(times, times)}
+        return {topic: Stamps(None, times)}
 
     source.survey = survey
 
@@ -97,5 +97,5 @@ def _frames(name: str, frames: list[tuple[int, Path]]) -> Iterator[ImageFrame]:
         if path.stat().st_size > _MAX_FILE:
             raise BadInputError(f"{where} is larger than {_MAX_FILE} bytes: give images of a camera")
         payload = path.read_bytes()
-        label = f"{one_line(path.name, 120)}" if t_ns == 0 else seconds_text(t_ns)
+        label = one_line(path.name, 120) if t_ns == 0 else seconds_text(t_ns)
         yield ImageFrame(t_ns, label, payload, partial(images.decode_compressed, payload, where))

@@ -1,0 +1,226 @@
+"""What is wrong with a recording before anything is estimated from it: times, units, saturation, images.
+
+Pure functions on arrays; each returns its findings, and `calibkit info` shows them all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.geometry import so3
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+G = 9.80665  # m/s^2
+
+_GAP = 2.5  # median intervals; above, samples are missing
+_LONG_GAP_S = 0.2  # above, interpolation across a gap is a guess even for a hand-held rig
+_JITTER = 0.1  # robust sigma of the interval over its median
+_CLOCKS_S = 0.1  # latencies of two sensors differ by more: one clock is wrong
+_FROZEN = 0.01  # share of samples that repeat the one before
+_DARK = 0.08  # mean over full scale
+_BLURRED = 0.4  # of the sharpest frames' sharpness
+_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know of a topic; `code` and `problem` are for machines."""
+
+    code: str
+    problem: bool  # False: a note
+    text: str
+
+
+def rate_hz(t_ns: Times) -> float | None:
+    """Return the rate by the median interval; None where times do not advance."""
+    steps = np.diff(t_ns)
+    steps = steps[steps > 0]
+    return float(1e9 / np.median(steps)) if len(steps) else None
+
+
+def check_times(t_ns: Times) -> list[Finding]:
+    """Find disorder, duplicates, gaps, single wrong stamps and jitter in the times of one stream."""
+    found = []
+    steps = np.diff(t_ns) * 1e-9
+    back, same = int(np.sum(steps < 0)), int(np.sum(steps == 0))
+    if back:
+        found.append(Finding("disorder", True, f"{back} stamps go back in time, by up to {-steps.min():.6g} s"))
+    if same:
+        found.append(Finding("duplicate", True, f"{same} stamps repeat the one before"))
+    steps = steps[steps > 0]
+    if len(steps) < 10:
+        return found
+    typical = float(np.median(steps))
+    spread = _MAD * float(np.median(np.abs(steps - typical)))
+    missing = steps > max(_GAP * typical, typical + 6 * spread)
+    if missing.any():
+        longest = int(np.argmax(np.diff(t_ns)))
+        at, length = (t_ns[longest] - t_ns[0]) * 1e-9, (t_ns[longest + 1] - t_ns[longest]) * 1e-9
+        lost = int(np.sum(np.rint(steps[missing] / typical) - 1))
+        text = f"{np.sum(missing)} gaps, about {lost} samples missing; the longest {length:.3g} s at {at:.3f} s from the start"
+        found.append(Finding("gap", bool(length > max(_LONG_GAP_S, 5 * typical)), text))
+    odd = (np.abs(steps - typical) > max(8 * spread, 0.25 * typical)) & ~missing
+    if odd.any() and spread < _JITTER * typical:
+        found.append(Finding("irregular", True, f"{np.sum(odd)} intervals are off by more than {max(8 * spread, 0.25 * typical):.3g} s"))
+    if spread >= _JITTER * typical:
+        found.append(
+            Finding("jitter", True, f"intervals scatter by {spread * 1e3:.3g} ms around {typical * 1e3:.4g} ms: stamped on arrival?")
+        )
+    return found
+
+
+def latency_s(header_ns: Times, record_ns: Times) -> float | None:
+    """Return the median of record time minus header time, over stamps that are set."""
+    stamped = header_ns != 0
+    return float(np.median((record_ns - header_ns)[stamped]) * 1e-9) if stamped.any() else None
+
+
+def check_headers(header_ns: Times, record_ns: Times) -> list[Finding]:
+    """Find header stamps that are zero, on another clock than the recorder's, or drifting against it."""
+    found = []
+    zeros = int(np.sum(header_ns == 0))
+    if zeros:
+        found.append(Finding("zero_stamp", True, f"{zeros} of {len(header_ns)} header stamps are zero: record times are used for them"))
+    latency = latency_s(header_ns, record_ns)
+    if latency is None:
+        return found
+    if abs(latency) > 1:
+        found.append(
+            Finding(
+                "other_clock", False, f"headers are {abs(latency):.6g} s {'before' if latency > 0 else 'after'} record times: another clock"
+            )
+        )
+    elif latency < -1e-3:
+        found.append(Finding("future_stamp", True, f"headers are {-latency * 1e3:.3g} ms after record times: stamped in the future"))
+    late = (record_ns - header_ns)[header_ns != 0] * 1e-9
+    third = len(late) // 3
+    duration = float(np.ptp(record_ns)) * 1e-9
+    if third >= 30 and duration > 10:
+        drift = float(np.median(late[-third:]) - np.median(late[:third])) / (duration * 2 / 3)
+        scatter = _MAD * float(np.median(np.abs(late - np.median(late))))
+        if abs(drift) > 100e-6 and abs(drift) * duration > max(5e-3, 2 * scatter):
+            found.append(Finding("clock_drift", True, f"headers drift against record times by {drift * 1e6:.0f} ppm"))
+    return found
+
+
+def check_clocks(latencies: dict[str, float]) -> list[Finding]:
+    """Find streams whose header clocks disagree, judged by their latencies against the one recorder."""
+    if len(latencies) < 2:
+        return []
+    low, high = min(latencies, key=latencies.__getitem__), max(latencies, key=latencies.__getitem__)
+    apart = latencies[high] - latencies[low]
+    if apart < _CLOCKS_S:
+        return []
+    text = f"stamps of {high} lie {apart:.4g} s before those of {low}, both against record times: a wrong clock, or a slow driver"
+    return [Finding("clocks_apart", True, text)]
+
+
+def check_overlap(spans: dict[str, tuple[int, int]]) -> list[Finding]:
+    """Find streams (name -> first and last time in ns) that share no time with the longest one."""
+    if not spans:
+        return []
+    longest = max(spans, key=lambda name: spans[name][1] - spans[name][0])
+    begin, end = spans[longest]
+    apart = [name for name, (first, last) in spans.items() if last < begin or first > end]
+    return [Finding("no_overlap", True, f"{name} shares no time with {longest}: another clock, or another recording") for name in apart]
+
+
+def check_accel(accel: Array) -> list[Finding]:
+    """Find accelerations that are not in m/s^2: at rest or on average |a| is g = 9.81 m/s^2."""
+    norm = float(np.median(np.linalg.norm(accel, axis=1)))
+    text = f"median |a| = {norm:.4g}"
+    for unit, one_g in (("m/s^2", G), ("g", 1.0), ("mg", 1000.0)):
+        if 0.8 * one_g < norm < 1.25 * one_g:
+            if unit == "m/s^2":
+                return [Finding("gravity", False, f"{text} m/s^2")]
+            return [Finding("accel_unit", True, f"{text}: the accelerometer is in {unit}, not m/s^2")]
+    if norm < 0.05 * G:
+        return [Finding("no_gravity", True, f"{text}: gravity is missing (removed by the driver, or no accelerometer)")]
+    return [Finding("accel_unit", True, f"{text}: neither m/s^2 (9.81) nor g (1): wrong unit or scale")]
+
+
+def check_gyro_unit(t_ns: Times, gyro: Array, accel: Array, window_s: float = 0.25) -> list[Finding]:
+    """Find a gyroscope in deg/s by how gravity's direction turns: |g x dg| over |integral of w across g| is 1 in rad/s, pi/180 in deg/s.
+
+    Means over windows keep linear acceleration small; windows that turn too little or too much are left out.
+    """
+    seconds = (t_ns - t_ns[0]) * 1e-9 if len(t_ns) else np.zeros(0)
+    window = np.maximum(seconds / window_s, 0).astype(np.int64)
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    if len(starts) < 20 or np.any(np.diff(seconds) < 0):
+        return []
+    counts = np.diff(starts, append=len(window))[:, None]
+    rate, down = np.add.reduceat(gyro, starts) / counts, np.add.reduceat(accel, starts) / counts
+    down /= np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-12)
+    middle = seconds[starts] + window_s / 2
+    # Two windows on: the mean rate between their middles is that of the three, the outer ones by half.
+    turn = np.linalg.norm(np.cross(down[:-2], down[2:]), axis=1)
+    mean_rate = (rate[:-2] + 2 * rate[1:-1] + rate[2:]) / 4
+    swept = np.linalg.norm(np.einsum("nij,nj->ni", so3.hat(down[1:-1]), mean_rate), axis=1) * (middle[2:] - middle[:-2])
+    usable = (turn > 0.05) & (turn < 0.8) & (swept > 0)
+    if np.sum(usable) < 10:
+        return []
+    ratio = float(np.median(turn[usable] / swept[usable]))
+    if abs(np.log(ratio * 180 / np.pi)) < np.log(2.5):
+        return [
+            Finding("gyro_unit", True, f"gravity turns {1 / ratio:.0f} times slower than the gyroscope says: it is in deg/s, not rad/s")
+        ]
+    if not 0.4 < ratio < 2.5:
+        return [Finding("gyro_scale", True, f"gravity turns {ratio:.3g} times as fast as the gyroscope says: wrong unit, axes or clock")]
+    return []
+
+
+def check_saturation(name: str, values: Array) -> list[Finding]:
+    """Find axes that stay at their extreme for 3 samples or more, as a clipped signal does and a quantised one hardly."""
+    clipped = []
+    for axis, column in zip("xyz", values.T, strict=True):
+        for extreme in (column.min(initial=0), column.max(initial=0)):
+            at = column == extreme
+            runs = np.diff(np.flatnonzero(np.diff(at, prepend=False, append=False)))[::2]
+            # A signal of few levels (a quantised sensor at rest) sits at its extreme by chance.
+            if len(runs) and runs.max() >= 3 and len(np.unique(column)) > 100:
+                clipped.append(f"{axis} at {extreme:.6g} ({np.sum(at)} samples)")
+    return [Finding("saturation", True, f"{name} is clipped: {', '.join(clipped)}")] if clipped else []
+
+
+def check_frozen(values: Array) -> list[Finding]:
+    """Find a sensor that repeats its last sample, as drivers do that run faster than their sensor."""
+    repeated = np.all(values[1:] == values[:-1], axis=1)
+    if len(repeated) < 10 or np.mean(repeated) < _FROZEN:
+        return []
+    return [
+        Finding("repeated", True, f"{np.mean(repeated):.1%} of the samples repeat the one before: the driver runs faster than the sensor")
+    ]
+
+
+def sharpness(gray: NDArray[np.generic]) -> float:
+    """Return the mean square of the Laplacian over that of the gradient: it falls with blur, and contrast cancels in it."""
+    image = gray.astype(np.float32)
+    across, down = np.diff(image, axis=1), np.diff(image, axis=0)
+    gradient = float(np.mean(across**2) + np.mean(down**2))
+    laplacian = np.diff(across, axis=1)[1:-1] + np.diff(down, axis=0)[:, 1:-1]
+    return float(np.mean(laplacian**2)) / gradient if gradient > 0 else 0.0
+
+
+def brightness(gray: NDArray[np.generic]) -> float:
+    """Return the mean gray over full scale; of 16-bit images with 12 or fewer bits used, over the scale in use."""
+    top = 255 if gray.dtype == np.uint8 else 2 ** max(8, int(gray.max(initial=0)).bit_length()) - 1
+    return float(gray.mean()) / top
+
+
+def check_images(bright: Array, sharp: Array) -> list[Finding]:
+    """Find dark, overexposed and blurred images in a sample (brightness and sharpness of each)."""
+    found = []
+    dark, blown, blurred = np.sum(bright < _DARK), np.sum(bright > 1 - _DARK), np.sum(sharp < _BLURRED * np.quantile(sharp, 0.9))
+    if dark:
+        found.append(
+            Finding("dark", bool(dark > len(bright) / 2), f"{dark} of {len(bright)} sampled images are dark (mean below {_DARK:.0%})")
+        )
+    if blown:
+        found.append(Finding("overexposed", bool(blown > len(bright) / 2), f"{blown} of {len(bright)} sampled images are overexposed"))
+    if blurred:
+        text = f"{blurred} of {len(sharp)} sampled images are blurred, by the measure of the sharpest"
+        found.append(Finding("blur", bool(blurred > len(sharp) / 3), text))
+    return found

@@ -1,0 +1,196 @@
+"""What a recording holds, what is wrong with it, and what each topic could be used for."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.progress import Progress, silent
+from calibkit.errors import BadInputError, one_line
+from calibkit.estimation import doctor
+from calibkit.estimation.doctor import Finding
+from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.recording import Recording, open_recording
+from calibkit.io.source import Stamps, TopicInfo
+
+_SAMPLE = 20  # images of a topic that are decoded and judged
+_TIMED = ("image", "imu", "pose", "camera_info", "corners", "cloud")  # kinds whose times matter
+
+
+@dataclass(frozen=True)
+class ImageSummary:
+    """What the sampled images of a topic look like."""
+
+    width: int
+    height: int
+    bits: int
+    sampled: int
+    brightness: float  # mean gray over full scale, median of the sample
+    sharpness: float  # see doctor.sharpness, median of the sample
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """One topic: what was claimed, what was found."""
+
+    topic: TopicInfo
+    held: int  # messages that could be read
+    rate_hz: float | None
+    start_ns: int | None
+    end_ns: int | None
+    image: ImageSummary | None
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class Info:
+    """All that `calibkit info` says."""
+
+    sources: tuple[str, ...]
+    topics: tuple[TopicReport, ...]
+    findings: tuple[Finding, ...]  # that concern several topics
+    warnings: tuple[str, ...]  # of reading: what was mended or left out
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last stamp of topics that have stamps."""
+        spans = [(t.start_ns, t.end_ns) for t in self.topics if t.start_ns and t.end_ns]
+        return (max(end for _, end in spans) - min(start for start, _ in spans)) * 1e-9 if spans else 0.0
+
+    @property
+    def problems(self) -> int:
+        """How many findings may spoil a calibration."""
+        return sum(f.problem for f in self.findings) + sum(f.problem for t in self.topics for f in t.findings)
+
+
+def info(
+    sources: list[Path], ros_distro: str | None = None, json_path: Path | None = None, force: bool = False, progress: Progress = silent
+) -> Info:
+    """Look through a recording and write what was found as JSON where asked; BadInputError where nothing can be read."""
+    if json_path is not None:
+        refuse_existing(json_path, force)
+    recording = open_recording(sources, ros_distro)
+    survey = recording.survey(progress)
+    topics = [_examine(recording, topic, survey[topic.name], progress) for topic in recording.topics]
+    names = tuple(dict.fromkeys(one_line(path.name or path.resolve().name, 120) for path in sources))
+    spans = {t.topic.name: (t.start_ns, t.end_ns) for t in topics if t.topic.kind in _TIMED and t.start_ns and t.end_ns}
+    findings = (*doctor.check_clocks(_latencies(recording, survey)), *doctor.check_overlap(spans))
+    result = Info(names, tuple(topics), findings, tuple(recording.warnings))
+    if json_path is not None:
+        write_atomic(json_path, json.dumps(as_json(result), indent=1, allow_nan=False) + "\n", overwrite=force)
+    return result
+
+
+def _latencies(recording: Recording, survey: dict[str, Stamps]) -> dict[str, float]:
+    """Return how long after their stamps the messages of each sensor were recorded, in s."""
+    found = {}
+    for topic in recording.topics:
+        stamps = survey[topic.name]
+        if topic.kind in _TIMED and stamps.header_ns is not None:
+            latency = doctor.latency_s(stamps.header_ns, stamps.record_ns)
+            if latency is not None:
+                found[topic.name] = latency
+    return found
+
+
+def _examine(recording: Recording, topic: TopicInfo, stamps: Stamps, progress: Progress) -> TopicReport:
+    headers = stamps.header_ns if stamps.header_ns is not None and np.any(stamps.header_ns) else None
+    times = stamps.record_ns if headers is None else headers[headers != 0]
+    stamped = bool(np.any(times))
+    findings = []
+    if topic.kind in _TIMED:
+        findings += doctor.check_times(times) if stamped else []
+        findings += doctor.check_headers(stamps.header_ns, stamps.record_ns) if stamps.header_ns is not None else []
+    image = None
+    if topic.kind == "imu":
+        findings += _imu_findings(recording, topic)
+    if topic.kind == "image":
+        image, seen = _image_findings(recording, topic, progress)
+        findings += seen
+    return TopicReport(
+        topic=topic,
+        held=len(stamps.record_ns) if topic.kind != "corners" else topic.count,
+        rate_hz=doctor.rate_hz(times),
+        start_ns=int(times.min()) if stamped else None,
+        end_ns=int(times.max()) if stamped else None,
+        image=image,
+        findings=tuple(findings),
+    )
+
+
+def _imu_findings(recording: Recording, topic: TopicInfo) -> list[Finding]:
+    samples = recording.imu(topic.name)
+    if not len(samples.t_ns):
+        return []
+    return [
+        *doctor.check_accel(samples.accel),
+        *doctor.check_gyro_unit(samples.t_ns, samples.gyro, samples.accel),
+        *doctor.check_saturation("the gyroscope", samples.gyro),
+        *doctor.check_saturation("the accelerometer", samples.accel),
+        *doctor.check_frozen(np.hstack([samples.gyro, samples.accel])),
+    ]
+
+
+def _image_findings(recording: Recording, topic: TopicInfo, progress: Progress) -> tuple[ImageSummary | None, list[Finding]]:
+    """Decode images spread over the topic and judge them."""
+    every = max(1, topic.count // _SAMPLE)
+    sizes: list[tuple[int, int, int]] = []
+    bright, sharp = [], []
+    broken: list[str] = []
+    for index, frame in enumerate(progress(recording.images(topic.name), f"images of {topic.name}", topic.count)):
+        if index % every:
+            continue
+        try:
+            gray: NDArray[np.generic] = frame.decode()
+        except BadInputError as error:
+            broken.append(str(error))
+            continue
+        sizes.append((gray.shape[1], gray.shape[0], gray.dtype.itemsize * 8))
+        bright.append(doctor.brightness(gray))
+        sharp.append(doctor.sharpness(gray))
+    findings = []
+    if broken:
+        text = f"{len(broken)} of {len(broken) + len(sizes)} sampled images cannot be read; the first: {broken[0]}"
+        findings.append(Finding("unreadable", True, text))
+    if not sizes:
+        return None, findings
+    if len(set(sizes)) > 1:
+        listed = ", ".join(f"{width} x {height} ({bits} bit)" for width, height, bits in sorted(set(sizes))[:4])
+        findings.append(Finding("mixed_sizes", True, f"images differ in size: {listed}"))
+    findings += doctor.check_images(np.array(bright), np.array(sharp))
+    return ImageSummary(*sizes[0], len(sizes), float(np.median(bright)), float(np.median(sharp))), findings
+
+
+def as_json(result: Info) -> dict[str, object]:
+    """Return everything as JSON of a stable schema, version 1; times in ns, rates in Hz."""
+
+    def finding(f: Finding) -> dict[str, object]:
+        return {"code": f.code, "problem": f.problem, "text": f.text}
+
+    return {
+        "format": "calibkit-info",
+        "version": 1,
+        "sources": list(result.sources),
+        "duration_s": result.duration_s,
+        "problems": result.problems,
+        "topics": [
+            {
+                "name": t.topic.name,
+                "type": t.topic.type,
+                "kind": t.topic.kind,
+                "count_claimed": t.topic.count,
+                "count": t.held,
+                "rate_hz": t.rate_hz,
+                "start_ns": t.start_ns,
+                "end_ns": t.end_ns,
+                "usable_for": t.topic.usable_for,
+                "image": None if t.image is None else vars(t.image),
+                "findings": [finding(f) for f in t.findings],
+            }
+            for t in result.topics
+        ],
+        "findings": [finding(f) for f in result.findings],
+        "warnings": list(result.warnings),
+    }

@@ -1,0 +1,126 @@
+"""Kalibr's AprilGrid in an image: a few tags found by OpenCV, the rest grown from them over the board.
+
+Each tag next to known ones is predicted by its neighbourhood (so that a lens may bend the board), its corners fitted, its code
+verified. No tag is believed for its own sake: it must lie where its neighbours say, and carry its own code.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.detection import april_tags
+from calibkit.detection.corner_fit import Smoothed, saddle, smooth, symmetry
+from calibkit.detection.found import NOTHING, Detection, Image, to_8_bit
+from calibkit.detection.plane_maps import apply, homographies, local_maps, predict
+from calibkit.errors import BadInputError
+from calibkit.models.board import AprilGrid
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_WIDE, _NARROW = 0.16, 0.12  # saddle windows in tag sides, for far and near starts
+_RADIUS = 0.18  # of the final window: inside the border and the small squares, blur included
+_AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
+
+
+def detect(image: Image, board: AprilGrid) -> Detection:
+    """Return the corners of the tags wholly in view; none where fewer than two tags fit together."""
+    n = board.columns * board.rows
+    if n > april_tags.N_TAGS:
+        raise BadInputError(
+            f"an AprilGrid of {board.columns} x {board.rows} needs {n} tags, the family 36h11 has {april_tags.N_TAGS}: use fewer"
+        )
+    xy = (board.points[:, :2] / board.tag_size).reshape(-1, 4, 2)
+    smoothed = smooth(image)
+    for tags, corners in april_tags.seeds(to_8_bit(image)):
+        uv, fitted = _start(smoothed, xy, tags, corners)
+        if fitted.any():
+            uv, fitted = _grow(smoothed, xy, 1 + board.spacing, uv, fitted)
+        if fitted.any(1).sum() >= 2:
+            return _finish(smoothed, xy, board.spacing, uv, fitted)
+    return NOTHING
+
+
+def _start(image: Smoothed, xy: Array, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
+    """Return the corners uv (t, 4, 2) that first guesses make known, and which (t, 4): tags whose code and place among the others hold."""
+    uv, fitted = np.zeros_like(xy), np.zeros(xy.shape[:2], bool)
+    on_board = tags < len(xy)
+    tags, corners = tags[on_board], corners[on_board]
+    corners, ok = _fit(image, corners, _WIDE)
+    good = ok.all(1) & april_tags.verify(image, tags, corners)
+    tags, corners = tags[good], corners[good]
+    if len(tags) >= 2:
+        agree = _largest_agreement(xy[tags], corners)
+        tags, corners = tags[agree], corners[agree]
+    uv[tags], fitted[tags] = corners, True
+    return uv, fitted
+
+
+def _largest_agreement(xy: Array, corners: Array) -> Mask:
+    """Return the most tags (n,) that the homography of some two neighbouring tags foretells, all four corners of each."""
+    n = len(xy)
+    centre = xy.mean(1)
+    apart = np.linalg.norm(centre[:, None] - centre, axis=-1) + np.diag(np.full(n, np.inf))
+    partner = np.argsort(apart, axis=1)[:, : min(3, n - 1)]
+    first = np.repeat(np.arange(n), partner.shape[1])
+    pair = np.zeros((len(first), n))
+    pair[np.arange(len(first)), first] = pair[np.arange(len(first)), partner.ravel()] = 1
+    H = homographies(xy.reshape(-1, 2), corners.reshape(-1, 2), np.repeat(pair, 4, axis=1))
+    error = np.linalg.norm(apply(H, xy.reshape(-1, 2)).reshape(-1, n, 4, 2) - corners, axis=-1).max(-1)
+    agree = error < _AGREE * _sides(corners)
+    best: Mask = agree[agree.sum(1).argmax()]
+    return best
+
+
+def _sides(corners: Array) -> Array:
+    side: Array = np.linalg.norm(corners - np.roll(corners, 1, axis=-2), axis=-1).mean(-1)
+    return side
+
+
+def _fit(image: Smoothed, corners: Array, window: float) -> tuple[Array, Mask]:
+    """Return the tags' corners (n, 4, 2) moved to saddles near them, and which (n, 4) have one; the others stay."""
+    x = (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3]) / 2
+    y = (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1]) / 2
+    J = np.repeat(window * np.stack([x, y], axis=-1), 4, axis=0)
+    uv, found = saddle(image, corners.reshape(-1, 2), J)
+    moved = uv.reshape(-1, 4, 2)
+    ok: Mask = (
+        found.reshape(-1, 4) & (np.linalg.norm(moved - corners, axis=-1) < 1.5 * window * _sides(corners)[:, None]) & _inside(image, moved)
+    )
+    return np.where(ok[..., None], moved, corners), ok
+
+
+def _inside(image: Smoothed, corners: Array) -> Mask:
+    inside: Mask = ((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1)
+    return inside
+
+
+def _grow(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask) -> tuple[Array, Mask]:
+    """Add every tag that its known neighbours lead to, with three corners or more and its own code."""
+    centre = xy.mean(1)
+    apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
+    known = np.asarray(fitted.any(1))
+    for reach, window in ((1.5, _NARROW), (1.5, _WIDE), (2.9, _WIDE)):  # the last leaps over tags that are hidden
+        neighbour = apart < reach
+        ask = np.flatnonzero(~known & neighbour[:, known].any(1))
+        while len(ask):
+            corners, ok = _fit(image, predict(xy[fitted], uv[fitted], xy[ask], step), window)
+            good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask.astype(np.int32), corners)
+            found = ask[good]
+            uv[found], fitted[found] = corners[good], ok[good]
+            known[found] = True
+            ask = np.flatnonzero(~known & neighbour[:, found].any(1))  # tags with a new neighbour to lead to them
+    return uv, fitted
+
+
+def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask) -> Detection:
+    """Pin down every corner of the known tags; those that found no saddle, or one out of line, start where the others say."""
+    step = 1 + spacing
+    corner = np.flatnonzero(np.repeat(fitted.any(1), 4))
+    sure, side = fitted.reshape(-1)[corner], np.repeat(_sides(uv), 4)[corner]
+    xy, start = xy.reshape(-1, 2)[corner], uv.reshape(-1, 2)[corner]
+    sure &= np.asarray(local_maps(xy, start, step)[1] < np.maximum(0.05 * side, 1))
+    if not sure.all() and sure.sum() >= 8:
+        start[~sure] = predict(xy[sure], start[sure], xy[~sure][:, None], step)[:, 0]
+    fit = symmetry(image, start, local_maps(xy, start, step)[0], min(_RADIUS, 0.6 * spacing))
+    ok = fit.ok & (local_maps(xy, fit.uv, step)[1] < np.maximum(0.05 * side, 1))
+    return Detection(corner[ok].astype(np.int32), fit.uv[ok], fit.sigma_px[ok])

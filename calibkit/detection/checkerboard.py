@@ -1,0 +1,112 @@
+"""Checkerboards and ChArUco boards: OpenCV finds which corner is which, the symmetry fit says where it is.
+
+A checkerboard looks the same turned by 180 degrees when rows + columns is even, and by 90 degrees when they are equal: its frame is then
+the finder's choice. Only tags (AprilGrid, ChArUco) or an odd sum settle it.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.detection.corner_fit import saddle, smooth, symmetry
+from calibkit.detection.found import NOTHING, Detection, Gray, Image, scaled_to, to_8_bit
+from calibkit.detection.plane_maps import local_maps
+from calibkit.errors import BadInputError
+from calibkit.models.board import Charuco, Checkerboard
+from calibkit.opencv import cv2
+
+Array = NDArray[np.float64]
+
+_WORK_SIZE = 1000  # px, long side at which boards are looked for first
+_RADIUS = 0.3  # of the windows, in squares
+_OUT_OF_LINE = 0.08  # squares
+_ENOUGH = 0.9  # of a checkerboard's corners: a glare may take a few
+
+
+def detect_checkerboard(image: Image, board: Checkerboard) -> Detection:
+    """Return the inner corners of a checkerboard wholly in view: one in part cannot say which part."""
+    gray = to_8_bit(image)
+    for size, find in _FINDERS:
+        resized, scale = scaled_to(gray, size)
+        uv = find(resized, (board.columns, board.rows))
+        if uv is not None:
+            corner = np.arange(board.columns * board.rows, dtype=np.int32)
+            xy = np.stack([corner % board.columns, corner // board.columns], axis=-1).astype(float)
+            found = _refine(image, corner, xy, (uv + 0.5) / scale - 0.5, _RADIUS)
+            if len(found.corner) >= _ENOUGH * len(corner):
+                return found
+    return NOTHING
+
+
+def _classic(gray: Gray, size: tuple[int, int]) -> Array | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(gray, size, flags=flags)
+    return corners.reshape(-1, 2).astype(float) if found else None
+
+
+def _sectors(gray: Gray, size: tuple[int, int]) -> Array | None:
+    found, corners = cv2.findChessboardCornersSB(gray, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    return corners.reshape(-1, 2).astype(float) if found else None
+
+
+def _sectors_exhaustive(gray: Gray, size: tuple[int, int]) -> Array | None:
+    found, corners = cv2.findChessboardCornersSB(
+        gray, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    )
+    return corners.reshape(-1, 2).astype(float) if found else None
+
+
+_Finder = Callable[[Gray, tuple[int, int]], "Array | None"]
+_FINDERS: tuple[tuple[int, _Finder], ...] = (
+    (_WORK_SIZE, _classic),
+    (_WORK_SIZE, _sectors),
+    (2 * _WORK_SIZE, _classic),
+    (2 * _WORK_SIZE, _sectors_exhaustive),
+)
+
+
+def _refine(image: Image, corner: NDArray[np.int32], xy: Array, uv: Array, radius: float) -> Detection:
+    """Return the corners at xy (n, 2) squares pinned down from uv (n, 2) px, those out of line with their neighbours left out."""
+    smoothed = smooth(image)
+    maps, _ = local_maps(xy, uv, 1.2)
+    start, found = saddle(smoothed, uv, radius * maps.J)
+    start = np.where(found[:, None], start, uv)
+    maps, _ = local_maps(xy, start, 1.2)
+    fit = symmetry(smoothed, start, maps, radius)
+    side = np.sqrt(np.abs(np.linalg.det(maps.J)))
+    ok = fit.ok & (local_maps(xy, fit.uv, 1.2)[1] < np.maximum(_OUT_OF_LINE * side, 1))
+    return Detection(corner[ok], fit.uv[ok], fit.sigma_px[ok])
+
+
+@lru_cache(maxsize=4)
+def charuco_board(board: Charuco) -> cv2.aruco.CharucoBoard:
+    """Return OpenCV's form of the board."""
+    name = board.dictionary
+    if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+        raise BadInputError(f"OpenCV has no tag dictionary {name!r}: use one such as DICT_4X4_50 or DICT_5X5_100")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    needed = board.columns * board.rows // 2
+    if needed > len(dictionary.bytesList):
+        raise BadInputError(
+            f"a ChArUco board of {board.columns} x {board.rows} needs {needed} tags, {name} has {len(dictionary.bytesList)}"
+        )
+    made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_size, board.marker_size, dictionary)
+    made.setLegacyPattern(board.legacy)
+    return made
+
+
+def detect_charuco(image: Image, board: Charuco) -> Detection:
+    """Return the inner corners in view, each next to a tag that was read."""
+    gray = to_8_bit(image)
+    resized, scale = scaled_to(gray, 2 * _WORK_SIZE)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board(board)).detectBoard(resized)
+    if ids is None or len(ids) < 4:
+        return NOTHING
+    corner = ids.ravel().astype(np.int32)
+    order = np.argsort(corner)
+    xy = board.points[corner[order], :2] / board.square_size
+    margin = (1 - board.marker_size / board.square_size) / 2  # white between a tag and its square's edge
+    uv = (corners.reshape(-1, 2)[order].astype(float) + 0.5) / scale - 0.5
+    return _refine(image, corner[order], xy, uv, min(_RADIUS, 1.2 * margin))

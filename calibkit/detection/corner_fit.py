@@ -1,0 +1,179 @@
+"""Sub-pixel corners where black and white squares meet, all corners of a frame at once.
+
+Windows are discs in the board's plane, carried to the image by each corner's local map `p(d) = c + J d + Q(d, d) / 2`, so that they stay
+inside the squares however the board is tilted or the lens bends it. Two fits share them: a quadratic saddle finds the corner from
+afar, and the point symmetry of the pattern, I(c + d) = I(c - d) for every d in the window, pins it down: it uses every edge pixel, needs
+no model of blur or contrast, and its residual is the honest noise. (Saddle: Lucchese & Mitra 2002; symmetry: the property that
+Duda & Frese 2018 build on.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.detection.found import Image
+from calibkit.detection.plane_maps import LocalMaps
+from calibkit.opencv import cv2
+
+Array = NDArray[np.float64]
+Smoothed = NDArray[np.float32]
+
+SMOOTHING_PX = 0.85  # Gaussian, before every fit: bilinear sampling of a sharper image errs by 0.01 px
+FLOOR_PX = 0.005  # sampling error that stays without any noise
+_MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
+_MIN_WINDOW_PX = 2.0
+_SHRINK = 0.5  # of a saddle window wider than that, each iteration
+
+
+def smooth(image: Image) -> Smoothed:
+    """Return the image as the fits want it: float32, Gaussian-smoothed."""
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX), np.float32)
+
+
+def sample(image: Smoothed, uv: Array) -> Array:
+    """Return the image's values (...) at pixels (..., 2), bilinear, the border repeated.
+
+    Not cv2.remap: that one rounds to 1/32 px.
+    """
+    h, w = image.shape
+    x, y = np.clip(uv[..., 0], 0, w - 1.001), np.clip(uv[..., 1], 0, h - 1.001)
+    column, row = x.astype(np.intp), y.astype(np.intp)
+    x -= column
+    y -= row
+    k = row * w + column
+    flat = image.ravel()
+    top, bottom = flat[k], flat[k + w]
+    top = top + x * (flat[k + 1] - top)
+    bottom = bottom + x * (flat[k + w + 1] - bottom)
+    out: Array = top + y * (bottom - top)
+    return out
+
+
+def _to_border(image: Smoothed, uv: Array) -> Array:
+    out: Array = np.minimum(uv, np.array(image.shape[::-1]) - 1 - uv).min(-1)
+    return out
+
+
+def _disc(n: int) -> Array:
+    axis = np.linspace(-1, 1, n)
+    points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    inside: Array = points[(points**2).sum(1) <= 1 + 1e-9]
+    return inside
+
+
+_WINDOW = _disc(9)
+_HALF = _WINDOW[(_WINDOW[:, 1] > 1e-9) | ((np.abs(_WINDOW[:, 1]) < 1e-9) & (_WINDOW[:, 0] > 1e-9))]  # one of each pair d, -d
+_WEIGHT = np.exp(-0.5 * (_HALF**2).sum(1))  # square root of the pair's weight
+_QUADRATIC = np.linalg.pinv(
+    np.stack([np.ones(len(_WINDOW)), *_WINDOW.T, _WINDOW[:, 0] ** 2, _WINDOW[:, 0] * _WINDOW[:, 1], _WINDOW[:, 1] ** 2], axis=1)
+)
+
+
+def saddle(image: Smoothed, uv: Array, J: Array, iterations: int = 3) -> tuple[Array, NDArray[np.bool_]]:
+    """Return corners (n, 2) at the saddle of a quadratic fitted to the window uv + J d, |d| <= 1, and where there is one.
+
+    J (n, 2, 2) carries the unit disc to pixels; a start up to about one window radius off converges.
+    """
+    uv = uv.copy()
+    long, _ = _extent(np.swapaxes(J, 1, 2) @ J)
+    size = np.clip(_to_border(image, uv) / long, 0.3, 1)
+    smallest = np.minimum(size, _MAX_WINDOW_PX / long)
+    found = np.ones(len(uv), bool)
+    for k in range(iterations):
+        window = np.maximum(size * _SHRINK**k, smallest)[:, None, None] * J
+        offsets = _WINDOW @ np.swapaxes(window, 1, 2)
+        _, gx, gy, a, b, c = (sample(image, uv[:, None] + offsets) @ _QUADRATIC.T).T
+        det = 4 * a * c - b * b
+        found = det < 0
+        det = np.where(found, det, -np.inf)
+        step = np.stack([b * gy - 2 * c * gx, b * gx - 2 * a * gy], axis=-1) / det[:, None]
+        step /= np.maximum(1, np.abs(step).max(1, keepdims=True))
+        uv += (window @ step[..., None])[..., 0]
+    return uv, found
+
+
+@dataclass(frozen=True)
+class CornerFit:
+    """Corners by point symmetry."""
+
+    uv: Array  # (n, 2) px
+    sigma_px: Array  # (n,) px per coordinate
+    ok: NDArray[np.bool_]  # (n,) a symmetric pattern with contrast in both directions, near the start
+
+
+def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, iterations: int = 2) -> CornerFit:
+    """Minimise sum_d w(d) [I(c + d) - I(c - d)]^2 over c by Gauss-Newton, d over half a disc of `radius` in the board's plane.
+
+    The covariance is propagated from the image noise through the same weights, the noise taken from the residuals:
+    N^-1 (J^T W C W J) N^-1 with C the correlation that smoothing leaves between samples.
+    """
+    metric = np.swapaxes(maps.J, 1, 2) @ maps.J
+    long, short = _extent(metric)
+    room = np.clip(_to_border(image, uv), _MIN_WINDOW_PX, _MAX_WINDOW_PX)
+    scale = np.minimum(np.clip(_MIN_WINDOW_PX / short, radius, 1.5 * radius), room / long)
+    odd = scale[:, None, None] * (_HALF @ np.swapaxes(maps.J, 1, 2))
+    squares = np.stack([_HALF[:, 0] ** 2 / 2, _HALF[:, 0] * _HALF[:, 1], _HALF[:, 1] ** 2 / 2], axis=-1)
+    even = scale[:, None, None] ** 2 * (squares @ maps.Q)
+
+    plus, minus = even + odd, even - odd
+    start, uv = uv, uv.copy()
+    h = np.array([[0.5, 0.0], [0.0, 0.5]])
+    columns = []
+    for e in h:
+        at = uv[:, None]
+        difference = (
+            sample(image, at + plus + e) - sample(image, at + plus - e) - sample(image, at + minus + e) + sample(image, at + minus - e)
+        )
+        columns.append(difference * _WEIGHT)
+    D = np.stack(columns, axis=-1)
+    normal = np.swapaxes(D, 1, 2) @ D
+    inverse = np.linalg.inv(normal + np.maximum(1e-9, 1e-6 * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(2))
+    gain = inverse @ np.swapaxes(D, 1, 2)  # (n, 2, pairs)
+    for _ in range(iterations):
+        first, second = sample(image, uv[:, None] + plus), sample(image, uv[:, None] + minus)
+        odd_part = (first - second) * _WEIGHT
+        step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
+        uv -= step
+
+    residual = ((odd_part - (D @ step[..., None])[..., 0]) ** 2).sum(1)
+    mean = ((first + second) @ _WEIGHT**2 / (2 * (_WEIGHT**2).sum()))[:, None]
+    signal = ((first - mean) ** 2 + (second - mean) ** 2) @ _WEIGHT**2
+    ok = (
+        (residual < 0.5 * signal)
+        & (_to_border(image, uv) > _MIN_WINDOW_PX)
+        & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
+        & np.isfinite(uv).all(1)
+    )
+    return CornerFit(uv, _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok), ok)
+
+
+def _extent(metric: Array) -> tuple[Array, Array]:
+    """Return the long and short half axes (n,) px of the ellipses that J makes of the unit disc, from J^T J."""
+    mean = (metric[:, 0, 0] + metric[:, 1, 1]) / 2
+    spread = np.hypot((metric[:, 0, 0] - metric[:, 1, 1]) / 2, metric[:, 0, 1])
+    return np.sqrt(np.maximum(mean + spread, 1e-12)), np.sqrt(np.maximum(mean - spread, 1e-12))
+
+
+def _pair_terms(sign: int) -> Array:
+    difference = (_HALF[:, None] + sign * _HALF[None]).reshape(-1, 2)
+    return np.stack([difference[:, 0] ** 2, 2 * difference[:, 0] * difference[:, 1], difference[:, 1] ** 2]).astype(np.float32)
+
+
+_APART, _ACROSS = _pair_terms(-1), _pair_terms(1)  # |J (d_k -+ d_l)|^2 is linear in J^T J
+
+
+def _sigma(variance: Array, gain: Array, metric: Array, ok: NDArray[np.bool_]) -> Array:
+    """Return sigma per coordinate (n,) from the smoothed image's noise variance per corner, shrunk towards the frame's own.
+
+    Samples at a distance r share exp(-r^2 / 4 s^2) of their noise, s the smoothing; `metric` is J^T J of the window.
+    """
+    typical = np.median(variance[ok]) if ok.any() else 0.0
+    noise = 0.5 * (variance + typical)
+    shape = (len(gain), len(_HALF), len(_HALF))
+    decay = np.stack([metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]], axis=-1).astype(np.float32) / -(4 * (SMOOTHING_PX**2 + 0.15))
+    correlation = (np.exp(decay @ _APART) - np.exp(decay @ _ACROSS)).reshape(shape)
+    weighted = (gain * _WEIGHT).astype(np.float32)
+    covariance = ((weighted @ correlation) * weighted).sum((1, 2))  # its trace
+    out: Array = np.sqrt(noise * covariance + FLOOR_PX**2)  # 2 (samples of a pair) / 2 (coordinates)
+    return out

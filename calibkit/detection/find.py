@@ -1,0 +1,110 @@
+"""All images of one camera to board corners: in threads, in order, few images in memory, from the cache where they were seen before."""
+
+import os
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import numpy as np
+
+from calibkit.data.observations import BoardViews, ImageFrame
+from calibkit.data.progress import Progress
+from calibkit.detection.boards import detect
+from calibkit.detection.cache import CornerCache, Entry
+from calibkit.detection.found import NOTHING
+from calibkit.errors import BadInputError, one_line
+from calibkit.models.board import Board
+from calibkit.opencv import cv2
+
+_NAMED = 3  # broken images named one by one
+Outcome = tuple[int, str, "Entry | BadInputError"]  # stamp, label, what came of the frame
+
+
+def find_boards(
+    frames: Iterable[ImageFrame], board: Board, camera: str, cache: CornerCache | None, progress: Progress, total: int | None = None
+) -> BoardViews:
+    """Return the board's corners in every frame that shows it; frames that cannot be decoded are counted and named in the warnings."""
+    outcomes = list(progress(_in_order(frames, board, cache), f"boards in {camera}", total))
+    broken = [f"{label}: {result}" for _, label, result in outcomes if isinstance(result, BadInputError)]
+    seen = [(t_ns, label, *result) for t_ns, label, result in outcomes if not isinstance(result, BadInputError)]
+    shown = [(t_ns, label, found) for t_ns, label, _, found in seen if len(found.corner)]
+    found = [detection for _, _, detection in shown] or [NOTHING]
+    return BoardViews(
+        board=board,
+        image_size=_one_size(camera, [(label, size) for _, label, size, _ in seen]),
+        t_ns=np.array([t_ns for t_ns, _, _ in shown], np.int64),
+        labels=tuple(label for _, label, _ in shown),
+        frame=np.repeat(np.arange(len(found), dtype=np.int32), [len(detection.corner) for detection in found]),
+        corner=np.concatenate([detection.corner for detection in found]),
+        uv=np.concatenate([detection.uv for detection in found]),
+        sigma_px=np.concatenate([detection.sigma_px for detection in found]),
+        camera=camera,
+        n_images=len(outcomes),
+        warnings=_about_broken(broken, len(outcomes)),
+    )
+
+
+def _one_size(camera: str, sizes: list[tuple[str, tuple[int, int]]]) -> tuple[int, int]:
+    """Return the size that all images share; the odd one out is named."""
+    counts = Counter(size for _, size in sizes)
+    if not counts:
+        return 0, 0
+    (common, _), *others = counts.most_common()
+    if others:
+        label, odd = next((label, size) for label, size in sizes if size != common)
+        raise BadInputError(
+            f"{camera}: image {one_line(label, 80)} is {odd[0]}x{odd[1]}, most others are {common[0]}x{common[1]}: "
+            "one camera has one image size, give each its own --camera or folder"
+        )
+    return common
+
+
+def _about_broken(broken: list[str], n_images: int) -> tuple[str, ...]:
+    if not broken:
+        return ()
+    more = f", and {len(broken) - _NAMED} more" if len(broken) > _NAMED else ""
+    named = "; ".join(one_line(text, 120) for text in broken[:_NAMED])
+    return (f"{len(broken)} of {n_images} images could not be read: {named}{more}",)
+
+
+def _in_order(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None) -> Iterator[Outcome]:
+    """Yield each frame's outcome in the frames' order, at most a few frames per worker under way."""
+    workers = os.cpu_count() or 1
+    waiting: deque[Future[Outcome]] = deque()
+    with _single_threaded_opencv():
+        pool = ThreadPoolExecutor(workers, thread_name_prefix="boards")
+        try:
+            for frame in frames:
+                waiting.append(pool.submit(_look, frame, board, cache))
+                if len(waiting) >= 3 * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:  # an interrupt or an error: what has not begun is dropped
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _look(frame: ImageFrame, board: Board, cache: CornerCache | None) -> Outcome:
+    key = cache.key(frame.payload, board) if cache else b""
+    entry = cache.get(key, board) if cache else None
+    if entry is None:
+        try:
+            image = frame.decode()
+        except BadInputError as error:
+            return frame.t_ns, frame.label, error
+        entry = (image.shape[1], image.shape[0]), detect(image, board)
+        if cache:
+            cache.put(key, *entry)
+    return frame.t_ns, frame.label, entry
+
+
+@contextmanager
+def _single_threaded_opencv() -> Iterator[None]:
+    """Keep OpenCV to one thread: the frames are the parallel work, and threads inside them would fight over the cores."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,99 @@
+"""Maps of the board's plane to the image, from the corners already found: homographies, and what a lens bends on top of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_NEAR = 0.9  # steps of the board over which neighbours tell where a corner is
+_STIFFNESS = 1e-3  # of the bending, so that few neighbours bend nothing
+
+
+def apply(H: Array, xy: Array) -> Array:
+    """Return homographies (n, 3, 3) of points (m, 2), or of each its own (n, m, 2), as (n, m, 2)."""
+    p = xy @ np.swapaxes(H[:, :, :2], 1, 2) + H[:, None, :, 2]
+    out: Array = p[..., :2] / np.where(np.abs(p[..., 2:]) < 1e-12, 1e-12, p[..., 2:])
+    return out
+
+
+def square_to(corners: Array) -> Array:
+    """Return the homographies (n, 3, 3) of the unit square (0,0) (1,0) (1,1) (0,1) to corners (n, 4, 2) (Heckbert 1989)."""
+    p0, p1, p2, p3 = np.moveaxis(corners, 1, 0)
+    a, b, s = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    det = np.where(np.abs(det) < 1e-9, 1e-9, det)
+    g = (s[:, 0] * b[:, 1] - s[:, 1] * b[:, 0]) / det
+    h = (a[:, 0] * s[:, 1] - a[:, 1] * s[:, 0]) / det
+    H = np.ones((len(corners), 3, 3))
+    H[:, :2, 0], H[:, :2, 1], H[:, :2, 2] = p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0
+    H[:, 2, 0], H[:, 2, 1] = g, h
+    return H
+
+
+def homographies(xy: Array, uv: Array, weight: Array) -> Array:
+    """Return H (m, 3, 3) with uv ~ H xy by weighted direct linear transformation; xy, uv (n, 2), weight (m, n)."""
+    shift, scale = uv.mean(0), max(float(uv.std()), 1e-6)
+    u, v = ((uv - shift) / scale).T
+    origin, size = xy.mean(0), max(float(xy.std()), 1e-6)
+    p = np.concatenate([(xy - origin) / size, np.ones((len(xy), 1))], axis=1)
+    zero = np.zeros_like(p)
+    rows = np.stack([np.concatenate([p, zero, -u[:, None] * p], axis=1), np.concatenate([zero, p, -v[:, None] * p], axis=1)], axis=1)
+    products = (np.swapaxes(rows, 1, 2) @ rows).reshape(len(xy), 81)
+    H = np.linalg.eigh((weight @ products).reshape(-1, 9, 9))[1][:, :, 0].reshape(-1, 3, 3)
+    back = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]])
+    there = np.array([[1 / size, 0, -origin[0] / size], [0, 1 / size, -origin[1] / size], [0, 0, 1]])
+    out: Array = back @ H @ there
+    return out
+
+
+def predict(xy: Array, uv: Array, ask: Array, step: float) -> Array:
+    """Return where groups of board points `ask` (m, k, 2) are in the image, from known points xy, uv (n, 2) around each group.
+
+    A homography weighted towards the group, and a weighted quadratic through its residuals for what the lens bends;
+    `step` is the board's period.
+    """
+    middle = ask.mean(1, keepdims=True)
+    d = (xy - middle) / step
+    weight = np.exp(-0.5 * (d**2).sum(-1) / _NEAR**2) + 1e-7
+    H = homographies(xy, uv, weight)
+    terms = _quadratic(d)
+    weighted = np.swapaxes(terms * weight[..., None], 1, 2)
+    normal = weighted @ terms + _STIFFNESS * np.eye(6) * weight.sum(1)[:, None, None]
+    bend = _quadratic((ask - middle) / step) @ np.linalg.solve(normal, weighted @ (uv - apply(H, xy)))
+    out: Array = np.clip(apply(H, ask) + bend, -1e5, 1e5)
+    return out
+
+
+def _quadratic(d: Array) -> Array:
+    x, y = d[..., 0], d[..., 1]
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+@dataclass(frozen=True)
+class LocalMaps:
+    """Second-order board -> image maps around each corner, in px per unit of the board's coordinates."""
+
+    J: Array  # (n, 2, 2)
+    Q: Array  # (n, 3, 2): d2/dx2, d2/dxdy, d2/dy2
+
+
+def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
+    """Fit `uv = c + J d + Q(d, d) / 2` around each corner by least squares with weights exp(-|d|^2 / (2 reach^2)).
+
+    xy (n, 2) in the board's plane, uv (n, 2) px. Also returns each corner's distance (n,) px to the map that its neighbours alone
+    make, scaled by how well they can tell: large where a corner does not belong to the pattern.
+    """
+    x, y = (xy / reach).T
+    square = x**2 + y**2
+    weight = np.exp(x[:, None] * x + y[:, None] * y - (square[:, None] + square) / 2)
+    terms = np.stack([np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=1)  # of the board's own origin: one product does all corners
+    normal = (weight @ (terms[:, :, None] * terms[:, None]).reshape(-1, 36)).reshape(-1, 6, 6)
+    normal += np.diag([1e-9, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3])  # a lone tag bends as little as it can
+    inverse = np.linalg.inv(normal)
+    c = inverse @ (weight @ (terms[:, :, None] * uv[:, None]).reshape(-1, 12)).reshape(-1, 6, 2)
+    fitted = (terms[:, None] @ c)[:, 0]
+    J = np.stack([c[:, 1] + x[:, None] * c[:, 3] + y[:, None] * c[:, 4], c[:, 2] + x[:, None] * c[:, 4] + y[:, None] * c[:, 5]], axis=-1)
+    leverage = np.minimum((terms[:, None] @ inverse @ terms[..., None])[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1
+    return LocalMaps(J / reach, c[:, 3:] / reach**2), np.linalg.norm(uv - fitted, axis=-1) / np.sqrt(1 - leverage)

@@ -37,7 +37,8 @@ def repeating(values: Array, cell: Index, n_cells: int, frame: Index) -> Repeati
     sums = np.stack([np.bincount(flat, values[:, j], n_blocks * n_cells).reshape(n_blocks, n_cells) for j in range(k)], axis=-1)
     total = counts.sum(axis=0)
     pairs = total**2 - np.sum(counts**2, axis=0)
-    weight = np.where(pairs > 0, total / np.where(pairs > 0, pairs, 1), 0) / max(len(values), 1)  # (c,)
+    met_again = pairs > 0  # cells that two blocks have seen: the others tell nothing
+    weight = np.where(met_again, total / np.where(met_again, pairs, 1), 0) / max(total[met_again].sum(), 1)  # (c,)
     mean = sums.sum(axis=0) / np.maximum(total, 1)[:, None]
     seen = np.sum(counts > 0, axis=0)
     unbiased = np.where(seen > 1, seen / np.maximum(seen - 1, 1), np.nan)[:, None]  # of the spread around the mean of as many blocks

@@ -68,6 +68,8 @@ def _render(picture: Picture, view: View) -> Drawn:
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in a script that the font lacks
         figure = Figure(figsize=(9, picture.height), layout="constrained")
         picture.draw(figure, view)
+        figure.draw_without_rendering()  # lay out once, not at each saving
+        figure.set_layout_engine("none")
         svg, png = io.BytesIO(), io.BytesIO()
         figure.savefig(svg, format="svg", dpi=130, metadata={"Date": None, "Creator": "calibkit"})
         figure.savefig(png, format="png", dpi=130, metadata={"Software": "calibkit"})

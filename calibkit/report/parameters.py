@@ -55,7 +55,7 @@ def _decimals(sigma: float) -> int:
 
 def number(value: float) -> str:
     """Return a sigma in two digits, plain where that is short."""
-    return f"{value:.{_decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}"
+    return f"{value:.{_decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}" if value else "0"
 
 
 def parts(rig: Rig) -> dict[str, Camera | Transform | TimeOffset]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibkit.detection import april_tags
 from calibkit.detection.corner_fit import Smoothed, saddle, smooth, symmetry
 from calibkit.detection.found import NOTHING, Detection, Image, to_8_bit
-from calibkit.detection.plane_maps import apply, homographies, local_maps, predict
+from calibkit.detection.plane_maps import apply, homographies, in_line, local_maps, predict
 from calibkit.errors import BadInputError
 from calibkit.models.board import AprilGrid
 
@@ -19,6 +19,7 @@ Mask = NDArray[np.bool_]
 
 _WIDE, _NARROW = 0.16, 0.12  # saddle windows in tag sides, for far and near starts
 _RADIUS = 0.18  # of the final window: inside the border and the small squares, blur included
+_OUT_OF_LINE = 0.05  # tag sides
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
 
 
@@ -98,7 +99,7 @@ def _grow(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask) -> t
     """Add every tag that its known neighbours lead to, with three corners or more and its own code."""
     centre = xy.mean(1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
-    known = np.asarray(fitted.any(1))
+    known: Mask = np.asarray(fitted.any(1), bool)
     for reach, window in ((1.5, _NARROW), (1.5, _WIDE), (2.9, _WIDE)):  # the last leaps over tags that are hidden
         neighbour = apart < reach
         ask = np.flatnonzero(~known & neighbour[:, known].any(1))
@@ -118,9 +119,9 @@ def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask)
     corner = np.flatnonzero(np.repeat(fitted.any(1), 4))
     sure, side = fitted.reshape(-1)[corner], np.repeat(_sides(uv), 4)[corner]
     xy, start = xy.reshape(-1, 2)[corner], uv.reshape(-1, 2)[corner]
-    sure &= np.asarray(local_maps(xy, start, step)[1] < np.maximum(0.05 * side, 1))
+    sure = sure & in_line(local_maps(xy, start, step)[1], _OUT_OF_LINE * side)
     if not sure.all() and sure.sum() >= 8:
         start[~sure] = predict(xy[sure], start[sure], xy[~sure][:, None], step)[:, 0]
     fit = symmetry(image, start, local_maps(xy, start, step)[0], min(_RADIUS, 0.6 * spacing))
-    ok = fit.ok & (local_maps(xy, fit.uv, step)[1] < np.maximum(0.05 * side, 1))
+    ok = fit.ok & in_line(local_maps(xy, fit.uv, step)[1], _OUT_OF_LINE * side)
     return Detection(corner[ok].astype(np.int32), fit.uv[ok], fit.sigma_px[ok])

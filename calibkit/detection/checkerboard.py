@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibkit.detection.corner_fit import saddle, smooth, symmetry
 from calibkit.detection.found import NOTHING, Detection, Gray, Image, scaled_to, to_8_bit
-from calibkit.detection.plane_maps import local_maps
+from calibkit.detection.plane_maps import in_line, local_maps
 from calibkit.errors import BadInputError
 from calibkit.models.board import Charuco, Checkerboard
 from calibkit.opencv import cv2
@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 _WORK_SIZE = 1000  # px, long side at which boards are looked for first
 _RADIUS = 0.3  # of the windows, in squares
-_OUT_OF_LINE = 0.08  # squares
+_REACH = 1.0  # squares over which neighbours tell how a lens bends
+_OUT_OF_LINE = 0.1  # squares
 _ENOUGH = 0.9  # of a checkerboard's corners: a glare may take a few
 
 
@@ -70,13 +71,13 @@ _FINDERS: tuple[tuple[int, _Finder], ...] = (
 def _refine(image: Image, corner: NDArray[np.int32], xy: Array, uv: Array, radius: float) -> Detection:
     """Return the corners at xy (n, 2) squares pinned down from uv (n, 2) px, those out of line with their neighbours left out."""
     smoothed = smooth(image)
-    maps, _ = local_maps(xy, uv, 1.2)
+    maps, _ = local_maps(xy, uv, _REACH)
     start, found = saddle(smoothed, uv, radius * maps.J)
     start = np.where(found[:, None], start, uv)
-    maps, _ = local_maps(xy, start, 1.2)
+    maps, _ = local_maps(xy, start, _REACH)
     fit = symmetry(smoothed, start, maps, radius)
     side = np.sqrt(np.abs(np.linalg.det(maps.J)))
-    ok = fit.ok & (local_maps(xy, fit.uv, 1.2)[1] < np.maximum(_OUT_OF_LINE * side, 1))
+    ok = fit.ok & in_line(local_maps(xy, fit.uv, _REACH)[1], _OUT_OF_LINE * side)
     return Detection(corner[ok], fit.uv[ok], fit.sigma_px[ok])
 
 

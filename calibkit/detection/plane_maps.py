@@ -97,3 +97,9 @@ def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
     J = np.stack([c[:, 1] + x[:, None] * c[:, 3] + y[:, None] * c[:, 4], c[:, 2] + x[:, None] * c[:, 4] + y[:, None] * c[:, 5]], axis=-1)
     leverage = np.minimum((terms[:, None] @ inverse @ terms[..., None])[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1
     return LocalMaps(J / reach, c[:, 3:] / reach**2), np.linalg.norm(uv - fitted, axis=-1) / np.sqrt(1 - leverage)
+
+
+def in_line(misfit: Array, allowed_px: Array) -> NDArray[np.bool_]:
+    """Return which corners belong to the pattern, from local_maps' misfit (n,) px: a strong lens bends them all, a wrong one stands out."""
+    out: NDArray[np.bool_] = misfit < np.maximum(np.maximum(allowed_px, 1), 5 * np.median(misfit))
+    return out

@@ -11,9 +11,10 @@ from calibkit.errors import BadInputError, one_line
 
 def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> None:
     """Write a file by way of a temporary one in the same folder; an existing file is refused unless `overwrite`."""
-    target = Path(os.path.realpath(path))  # through links, so that the link stays one
-    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}.tmp")
+    target = path
     try:
+        target = Path(os.path.realpath(path))  # through links, so that the link stays one
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
         refuse_existing(target, overwrite)
         try:
             _write_synced(temporary, content.encode() if isinstance(content, str) else content)

@@ -50,7 +50,7 @@ def _count(field: str, what: str, least: int) -> _Key:
 
 
 def _length(field: str, what: str) -> _Key:
-    return _Key(field, float, lambda v: 0 < v <= 100, f"give {what} in metres, such as 0.05")
+    return _Key(field, float, lambda v: 1e-4 <= v <= 100, f"give {what} in metres, such as 0.05")
 
 
 def _flag(field: str) -> _Key:
@@ -64,7 +64,7 @@ _TARGETS: dict[str, tuple[Callable[..., Board], dict[str, _Key]]] = {
             "tagCols": _count("columns", "tags along x", 1),
             "tagRows": _count("rows", "tags along y", 1),
             "tagSize": _length("tag_size", "the edge of a tag's black square"),
-            "tagSpacing": _Key("spacing", float, lambda v: 0 < v <= 10, "give the gap between tags divided by tagSize, such as 0.3"),
+            "tagSpacing": _Key("spacing", float, lambda v: 0.01 <= v <= 10, "give the gap between tags divided by tagSize, such as 0.3"),
         },
     ),
     Checkerboard.kind: (

@@ -21,7 +21,7 @@ from calibkit.report.signals import frame_tilts
 from calibkit.report.view import View, given
 
 INK, ACCENT, PALE = "#1f3b57", "#c1440e", "#9fb3c8"
-MAX_BARS = 60
+MAX_BARS = 120
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "calibkit",  # ids that do not change from run to run
     "font.family": "DejaVu Sans",

@@ -12,9 +12,9 @@ from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.models.cameras import CAMERAS
 from calibkit.opencv import cv2
-from calibkit.simulation.camera import SimCamera, place_board, random_board_poses
+from calibkit.simulation.camera import RenderStyle, SimCamera, place_board, random_board_poses
 from calibkit.simulation.corners import views_of_poses
-from calibkit.simulation.render import Renderer, RenderStyle
+from calibkit.simulation.render import Renderer
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""A camera of a simulated rig, and where boards stand before it."""
+"""A camera of a simulated rig, how its pictures look, and where boards stand before it."""
 
 from dataclasses import dataclass, field
 
@@ -27,6 +27,19 @@ class SimCamera:
     rate_hz: float = 10.0
     name: str = "cam0"
     topic: str = "/cam0/image_raw"
+
+
+@dataclass(frozen=True)
+class RenderStyle:
+    """How the scene is lit and how the sensor blurs it; gray levels of 255."""
+
+    black: float = 25.0
+    white: float = 205.0
+    wall: int = 120  # behind the board, on a scale from 0 `black` to 255 `white`
+    lighting: float = 0.3  # relative change of the light across the image
+    blur_px: float = 0.5  # sigma of the optics
+    noise: float = 2.0  # sigma of the sensor
+    supersampling: int = 3
 
 
 def board_centre(board: Board) -> Array:

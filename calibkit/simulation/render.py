@@ -1,7 +1,6 @@
 """Images of a board through any lens, by inverse mapping: pixel -> ray -> board plane -> texture, averaged over each pixel's area."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.opencv import cv2
-from calibkit.simulation.camera import SimCamera
+from calibkit.simulation.camera import RenderStyle, SimCamera
 from calibkit.simulation.texture import Canvas, Texture, make_texture
 
 Array = NDArray[np.float64]
@@ -17,19 +16,6 @@ Gray = NDArray[np.uint8]
 
 _TAG_CELLS = 10  # Kalibr's tag: 6 data bits and two bits of border on each side
 _FAR = -1e6  # a texel that is on no board
-
-
-@dataclass(frozen=True)
-class RenderStyle:
-    """How the scene is lit and how the sensor blurs it; gray levels of 255."""
-
-    black: float = 25.0
-    white: float = 205.0
-    wall: int = 120  # behind the board, on a scale from 0 `black` to 255 `white`
-    lighting: float = 0.3  # relative change of the light across the image
-    blur_px: float = 0.5  # sigma of the optics
-    noise: float = 2.0  # sigma of the sensor
-    supersampling: int = 3
 
 
 def paint_aprilgrid(board: AprilGrid) -> Texture:

@@ -70,8 +70,8 @@ _ORBIT = (
 # The board wanders over the whole image, nearer and farther, and turns in it.
 _WANDER = (
     (0.11, 0, 0, 0.24, 0, 0, 0),
-    (0.23, 0, 0, 0, 0, 0.30, 0),
-    (0.17, 0, 0, 0, 0.22, 0, 0),
+    (0.23, 0, 0, 0, 0, 0.36, 0),
+    (0.17, 0, 0, 0, 0.26, 0, 0),
     (0.21, 0, 0, 0, 0, 0, 0.45),
 )
 # What the IMU needs: accelerations near 1.5 m/s^2 and rates near 1 rad/s on every axis.

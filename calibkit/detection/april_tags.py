@@ -19,7 +19,8 @@ Ids = NDArray[np.int32]
 
 _FAMILY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
 N_TAGS = len(_FAMILY.bytesList)
-_BITS, _BORDER = 6, 2
+_BITS, BORDER = 6, 2
+CELLS = _BITS + 2 * BORDER  # across a tag
 _WORK_SIZE = 1000  # px, long side of the image in which tags are looked for first
 
 
@@ -42,8 +43,8 @@ def _templates() -> Array:
 
 
 _TEMPLATES = _templates()
-_SIDE = _BITS + 2 * _BORDER
-_CELLS = (np.stack(np.meshgrid(np.arange(_BITS), np.arange(_BITS)), axis=-1).reshape(-1, 2) + _BORDER + 0.5) / _SIDE  # (36, 2) in tag sides
+
+_CELLS = (np.stack(np.meshgrid(np.arange(_BITS), np.arange(_BITS)), axis=-1).reshape(-1, 2) + BORDER + 0.5) / CELLS  # (36, 2) in tag sides
 _RIM = np.array([[t, e] for t in (0.3, 0.5, 0.7) for e in (0.1, 0.9)])
 _RIM = np.concatenate([_RIM, _RIM[:, ::-1]])  # in the black border
 
@@ -61,7 +62,7 @@ def verify(image: Smoothed, tags: Ids, corners: Array) -> NDArray[np.bool_]:
 
 def _finder(**settings: float) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = _BORDER
+    parameters.markerBorderBits = BORDER
     for name, value in settings.items():
         setattr(parameters, name, value)
     return cv2.aruco.ArucoDetector(_FAMILY, parameters)

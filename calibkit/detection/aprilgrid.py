@@ -91,8 +91,7 @@ def _fit(image: Smoothed, corners: Array, window: float) -> tuple[Array, Mask]:
 
 
 def _inside(image: Smoothed, corners: Array) -> Mask:
-    inside: Mask = ((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1)
-    return inside
+    return np.asarray(((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1))
 
 
 def _grow(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask) -> tuple[Array, Mask]:

@@ -99,21 +99,37 @@ def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: I
     return _solve(used, problem, LensState(tuple(lenses), T_cam_cam0, T_cam0_board), dropped, robust)
 
 
-def refit(fit: LensFit, frames: Sequence[Mask]) -> LensFit:
-    """Return the plain fit of some of the views of one that is done, started from it."""
+def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None) -> LensFit:
+    """Return the plain fit of some of the views of one that is done, started from it.
+
+    With `lenses_of`, lenses and camera positions are held at that fit's and the poses alone are free.
+    """
     grids = [_rows(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
     kept = _renumber(grids)
     state = replace(fit.state, T_cam0_board=fit.state.T_cam0_board[kept])
-    solution = minimise(replace(fit.problem, cameras=tuple(grids)), state)
+    problem = replace(fit.problem, cameras=tuple(grids))
+    if lenses_of is not None:
+        state = replace(state, lenses=lenses_of.state.lenses, T_cam_cam0=lenses_of.state.T_cam_cam0)
+        problem = replace(problem, free_lens=False, free_rig=False)
+    solution = minimise(problem, state)
     return LensFit(
         tuple(views.select(rows) for views, rows in zip(fit.views, frames, strict=True)),
-        replace(fit.problem, cameras=tuple(grids)),
+        problem,
         solution.x,
         solution.system,
         tuple(mask[rows] for mask, rows in zip(fit.observed, frames, strict=True)),
         fit.dropped,
         solution.converged,
     )
+
+
+def instant_times(fit: LensFit) -> Array:
+    """Return each instant's time in s from the first; without stamps every image counts as a second of its own."""
+    m = len(fit.state.T_cam0_board)
+    t = np.zeros(m, np.int64)
+    for views, camera in zip(fit.views, fit.problem.cameras, strict=True):
+        t[camera.instant] = views.t_ns
+    return (t - t.min()) * 1e-9 if t.any() else np.arange(m, dtype=float)
 
 
 def _rows(grid: CameraViews, rows: Mask) -> CameraViews:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews
-from calibkit.estimation.lens_fit import LensFit
+from calibkit.estimation.lens_fit import LensFit, instant_times
 from calibkit.geometry.so3 import Array, hat
 from calibkit.models.cameras import CameraModel
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
@@ -14,15 +14,6 @@ from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 _SAME_ORIENTATION = np.deg2rad(5.0)
 MIN_ORIENTATIONS = 3
 _GRID = (24, 16)
-
-
-def instant_times(fit: LensFit) -> Array:
-    """Return each instant's time in s from the first; without stamps every image counts as a second of its own."""
-    m = len(fit.state.T_cam0_board)
-    t = np.zeros(m, np.int64)
-    for views, camera in zip(fit.views, fit.problem.cameras, strict=True):
-        t[camera.instant] = views.t_ns
-    return (t - t.min()) * 1e-9 if t.any() else np.arange(m, dtype=float)
 
 
 def lens_covariance(fit: LensFit) -> Covariance:
@@ -38,17 +29,19 @@ def lens_covariance(fit: LensFit) -> Covariance:
 
 
 def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:
-    """Return what each border parameter must be known to: 1 px of focal length, centre and, at the image's edge, each coefficient."""
+    """Return what each border parameter must be known to.
+
+    1 px of focal length and centre; of each coefficient what moves a pixel by 1 px where the outermost corners were (at the edge of
+    what was seen: the 99th percentile of |duv/dk| over the corners).
+    """
     scales = np.empty(problem.border_size)
     for views, lens, where in zip(problem.cameras, lenses, problem.lens_slices, strict=True):
-        width, height = views.image_size
-        x, y = np.meshgrid([0.0, (width - 1) / 2, width - 1.0], [0.0, (height - 1) / 2, height - 1.0])
-        rays, valid = views.model.unproject(np.stack([x.ravel(), y.ravel()], axis=-1), lens)
-        J = views.model.project(rays, lens, jacobians=True).J_params
+        rays, valid = views.model.unproject(views.uv[views.weight > 0][:: max(1, int(np.sum(views.weight > 0)) // 5000)], lens)
+        J = views.model.project(rays[valid], lens, jacobians=True).J_params
         assert J is not None
-        effect = np.max(np.linalg.norm(J[valid], axis=-2), axis=0) if valid.any() else np.ones(len(lens))
+        effect = np.percentile(np.linalg.norm(J, axis=-2), 99, axis=0) if valid.any() else np.ones(len(lens))
+        effect[:4] = 1.0
         scales[where] = SCALES["px"] / np.maximum(effect, 1e-9)
-        scales[where][:4] = SCALES["px"]
     for c in range(1, len(problem.cameras)):
         scales[problem.rig_slice(c)] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
     return scales

@@ -85,7 +85,7 @@ def covariance_in_time(S: Array, scores: Array, t_s: Array, variance_factor: flo
     Blocks are 1, 2, 4, ... s long while at least nine remain; the length that shows the most correlation is taken (batch means
     grow with the length until they hold it all).
     """
-    choices = []
+    choices: list[Covariance] = []
     length = 1.0
     while True:
         block = np.unique(np.floor((t_s - t_s.min()) / length), return_inverse=True)[1]

@@ -1,0 +1,84 @@
+"""`calibkit intrinsics`: from a recording of a board to calibrated cameras."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("intrinsics")(run)
+
+
+def run(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="SOURCE...", help="Bags, image folders, ASL folders or corner CSV files, on one clock.")
+    ],
+    target: Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target YAML.")],
+    camera: Annotated[
+        list[str] | None,
+        typer.Option("--camera", metavar="TOPIC", help="Image topic, or cam0=/topic; repeat for several cameras. [default: the only one]"),
+    ] = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model",
+            help="auto (by held-out error), pinhole-radtan, pinhole-radtan5, pinhole-radtan8, pinhole-equi (kb4); once or per camera.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, its residuals beside it.")
+    ] = None,
+    rig: Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add the cameras to; repeatable.")] = None,
+    report: Annotated[Path | None, typer.Option("--report", metavar="DIR", help="Write the report (HTML, pictures, JSON) here.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
+    resolution: Annotated[
+        str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")
+    ] = None,
+    loss: Annotated[
+        str, typer.Option("--loss", help="robust (outliers are found and given up) or plain (least squares over everything).")
+    ] = "robust",
+    max_views: Annotated[int, typer.Option("--max-views", min=10, help="Beyond this many, the most telling views are chosen.")] = 1500,
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")] = False,
+    ros_distro: Annotated[
+        str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite outputs.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")] = False,
+) -> None:
+    """Calibrate cameras: lens, sigma of every number, verdict with reasons; several cameras with the transforms between them.
+
+    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
+    """
+    from calibkit.cli.progress import bar
+    from calibkit.cli.shown import show
+    from calibkit.errors import BadInputError
+    from calibkit.stages.intrinsics import AUTO, Options, intrinsics
+    from calibkit.stages.outputs import Outputs
+
+    if loss not in ("robust", "plain"):
+        raise BadInputError("--loss is robust or plain")
+    options = Options(
+        cameras=tuple(camera or ()),
+        models=tuple(model or (AUTO,)),
+        resolution=_size(resolution),
+        robust=loss == "robust",
+        max_views=max_views,
+        cache=not no_cache,
+        ros_distro=ros_distro,
+    )
+    outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=" ".join(["calibkit", *sys.argv[1:]]))
+    show(intrinsics(sources, target, outputs, options, bar), strict)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    from calibkit.errors import BadInputError, one_line
+
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:7]) < 100000 for part in parts):
+        raise BadInputError(f"--resolution {one_line(text)}: write WIDTHxHEIGHT in px, such as 752x480")
+    return int(parts[0]), int(parts[1])

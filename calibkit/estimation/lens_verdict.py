@@ -1,0 +1,116 @@
+"""What to say of a fitted lens: which numbers are known, why not, and which view would mend it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.data.verdict import Reason, Status, Verdict
+from calibkit.estimation.lens_fit import LensFit, instant_times
+from calibkit.estimation.lens_trust import ProjectionSigma, border_scales, orientations, projection_sigma
+from calibkit.estimation.model_choice import ModelScore
+from calibkit.estimation.view_advice import best_view, region_of
+from calibkit.geometry.so3 import Array
+from calibkit.solver.trust import Covariance, directions, grade
+
+MIN_LOOKS = 3  # orientations, and seconds: two numbers of fx fy cx cy a look, and one look to check them
+_WORSE_MODEL, _WRONG_MODEL = 1.1, 2.0  # held-out error over the best model's
+_EXTRAPOLATED_PX = 1.0
+_DROPPED_FRAMES = 0.1
+
+
+@dataclass(frozen=True)
+class LensJudgement:
+    """One camera's verdict, in its parts."""
+
+    statuses: tuple[Status, ...]  # by lens parameter
+    reasons: tuple[Reason, ...]
+    projection: ProjectionSigma
+
+
+def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[ModelScore]) -> LensJudgement:
+    """Return what the recording says about camera c's lens."""
+    where, views = fit.problem.lens_slices[c], fit.problem.cameras[c]
+    camera, lens = fit.views[c].camera, fit.state.lenses[c]
+    cov = covariance.corrected[where, where]
+    scales = border_scales(fit.problem, fit.state.lenses)[where]
+    projection = projection_sigma(views, lens, cov)
+    reasons = [*_model_reasons(camera, views.model.name, scores), *_frame_reasons(fit, c)]
+    too_few = _too_few_looks(fit, c)
+    if too_few:
+        return LensJudgement((Status.NOT_OBSERVABLE,) * len(lens), (Reason(Verdict.FAIL, f"{camera}: {too_few}"), *reasons), projection)
+    statuses = tuple(Status(grade(float(ratio))) for ratio in np.sqrt(np.diag(cov)) / scales)
+    reasons += _direction_reasons(fit, c, covariance, cov, scales)
+    reasons += _extrapolation_reasons(camera, views.image_size, projection)
+    if not fit.converged:
+        reasons.append(Reason(Verdict.CHECK, f"{camera}: the solver stopped before it had converged"))
+    return LensJudgement(statuses, tuple(reasons), projection)
+
+
+def _too_few_looks(fit: LensFit, c: int) -> str:
+    """Say why the views cannot tell a lens at all, or nothing."""
+    views = fit.problem.cameras[c]
+    seconds = len(np.unique(np.floor(instant_times(fit)[views.instant])))
+    if seconds < MIN_LOOKS:
+        span = f"{len(views.instant)} views within {seconds} s" if fit.views[c].t_ns.any() else f"{len(views.instant)} views"
+        return (
+            f"the lens is not observable: {span} are {seconds} independent look{'s' if seconds > 1 else ''} at the board, at least "
+            f"{MIN_LOOKS} are needed; record 15 s or more with the board tilted 30 to 45 deg in all directions"
+        )
+    seen = orientations(fit.problem, fit, c)
+    if seen.count < MIN_LOOKS:
+        return (
+            f"the lens is not observable: the board was always seen from nearly one side (normals within {np.degrees(seen.spread):.1f} "
+            f"deg), so focal length and distance cannot be told apart; tilt the board 30 to 45 deg in all directions"
+        )
+    return ""
+
+
+def _model_reasons(camera: str, model: str, scores: Sequence[ModelScore]) -> list[Reason]:
+    mine = next((score for score in scores if score.model == model), None)
+    best = min(scores, key=lambda score: score.error_px, default=None)
+    if mine is None or best is None or mine.within or not mine.error_px > _WORSE_MODEL * best.error_px:
+        return []
+    wrong = mine.error_px > _WRONG_MODEL * best.error_px
+    text = f"on held-out views {model} errs by {mine.error_px:.2f} px, {best.model} by {best.error_px:.2f} px"
+    if wrong:
+        return [Reason(Verdict.FAIL, f"{camera}: {model} is the wrong model for this lens: {text}; use --model {best.model}")]
+    return [Reason(Verdict.CHECK, f"{camera}: {best.model} fits this lens better: {text}")]
+
+
+def _frame_reasons(fit: LensFit, c: int) -> list[Reason]:
+    camera = fit.views[c].camera
+    bad = [view for view in fit.dropped if view.camera == camera]
+    total = len(bad) + fit.views[c].n_frames
+    if len(bad) <= _DROPPED_FRAMES * total:
+        return []
+    named = "; ".join(f"{view.label}: {view.why}" for view in bad[:3]) + ("; ..." if len(bad) > 3 else "")
+    return [Reason(Verdict.CHECK, f"{camera}: {len(bad)} of {total} views were given up ({named})")]
+
+
+def _direction_reasons(fit: LensFit, c: int, covariance: Covariance, cov: Array, scales: Array) -> list[Reason]:
+    """Name the weakest direction of the lens and the view that would help it most."""
+    weakest = directions(cov, scales)[0]
+    if weakest.grade == "determined":
+        return []
+    names = fit.problem.cameras[c].model.parameter_names
+    share = np.abs(weakest.vector)
+    involved = ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.35 * share.max())
+    # A direction of the scaled lens, as a row vector on the lens itself.
+    advice = best_view(fit, c, cov, weakest.vector / scales, covariance.variance_factor)
+    remedy = f"; add views with {advice.text} (ten of them: {advice.sigma_ratio:.0%} of today's sigma)" if advice else ""
+    verdict = Verdict.CHECK if weakest.grade == "weak" else Verdict.FAIL
+    text = f"{involved} together are {weakest.grade}: known to {weakest.sigma:.1f} px at the outermost corners{remedy}"
+    return [Reason(verdict, f"{fit.views[c].camera}: {text}")]
+
+
+def _extrapolation_reasons(camera: str, size: tuple[int, int], projection: ProjectionSigma) -> list[Reason]:
+    """Name the part of the image where a point's pixel is not known, and whether a board was there."""
+    sigma = np.where(np.isnan(projection.sigma), -1.0, projection.sigma)
+    worst = int(np.argmax(sigma))
+    if sigma[worst] <= _EXTRAPOLATED_PX:
+        return []
+    empty = "" if projection.seen[worst] else "no board was seen there, and "
+    region = region_of(projection.uv[worst], size)
+    text = f"in the {region} of the image {empty}a point's pixel is known to {sigma[worst]:.1f} px only; bring the board there"
+    return [Reason(Verdict.CHECK, f"{camera}: {text}")]

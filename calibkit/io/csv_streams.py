@@ -14,7 +14,7 @@ from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.folder import stamp_ns
-from calibkit.io.ros_bag import unit_poses
+from calibkit.io.ros_bag import plausible, unit_poses
 from calibkit.io.source import CornerRows, Source, Stamps, TopicInfo
 
 Array = NDArray[np.float64]
@@ -127,15 +127,15 @@ def _imu(path: Path, name: str, warn: Callable[[str], None]) -> ImuSamples:
     t_ns = table.times()
     gyro = table.numbers(*_GYRO) * table.scale("wx", _GYRO_UNITS)
     accel = table.numbers(*_ACCEL) * table.scale("ax", _ACCEL_UNITS)
-    good = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    good = plausible(gyro) & plausible(accel)
     if not good.all():
         warn(f"{name}: {np.sum(~good)} samples are not finite and left out")
     return ImuSamples(t_ns[good], gyro[good], accel[good])
 
 
-def _poses(path: Path, name: str, warn: Callable[[str], None]) -> PoseSamples:
+def _poses(path: Path, name: str, topic: str, warn: Callable[[str], None]) -> PoseSamples:
     table = _table(path, name, warn)
-    samples, lost = unit_poses(table.times(), table.numbers(*_Q), table.numbers(*_XYZ), "world", name)
+    samples, lost = unit_poses(table.times(), table.numbers(*_Q), table.numbers(*_XYZ), "world", topic)
     if lost:
         warn(f"{name}: {lost} poses have no proper rotation or are not finite, and are left out")
     return samples
@@ -160,24 +160,25 @@ _KINDS = (
 )
 
 
-def csv_source(path: Path, name: str) -> Source:
+def csv_source(path: Path, topic: str) -> Source:
     """Return the stream in a CSV file; BadInputError where it is none that is known."""
-    source = Source(name, [path])
-    table = _table(path, name, source.warn)
+    name = one_line(path.name, 120)
+    source = Source(name if path.stem == topic else f"{topic}/{name}", [path])
+    table = _table(path, source.name, source.warn)
     found = next(((kind, title) for kind, title, needed in _KINDS if needed <= table.columns.keys()), None)
     if found is None:
-        raise BadInputError(f"{name} is not recognised: {_WANTED}")
+        raise BadInputError(f"{source.name} is not recognised: {_WANTED}")
     kind, title = found
-    source.topics.append(TopicInfo(name, title, kind, len(table.lines)))
-    source.corners.update({name: partial(_corners, path, name, source.warn)} if kind == "corners" else {})
-    source.imu.update({name: partial(_imu, path, name, source.warn)} if kind == "imu" else {})
-    source.poses.update({name: partial(_poses, path, name, source.warn)} if kind == "pose" else {})
+    source.topics.append(TopicInfo(topic, title, kind, len(table.lines)))
+    source.corners.update({topic: partial(_corners, path, source.name, source.warn)} if kind == "corners" else {})
+    source.imu.update({topic: partial(_imu, path, source.name, source.warn)} if kind == "imu" else {})
+    source.poses.update({topic: partial(_poses, path, source.name, topic, source.warn)} if kind == "pose" else {})
 
     def survey(progress: Progress) -> dict[str, Stamps]:
-        t_ns = _table(path, name, source.warn).times()
+        t_ns = _table(path, source.name, source.warn).times()
         if kind == "corners":
             t_ns = t_ns[np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))]  # one stamp a frame, not one a corner
-        return {name: Stamps(None, t_ns)}
+        return {topic: Stamps(None, t_ns)}
 
     source.survey = survey
     return source

@@ -10,6 +10,8 @@ from urllib.parse import quote
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Channel, Message, ros_type
 
+_ERRORS = (sqlite3.Error, UnicodeDecodeError, OverflowError)  # a message of SQLite's may quote damaged bytes of the file
+
 
 class Db3File:
     """One .db3 file; see `container.Container`."""
@@ -28,7 +30,7 @@ class Db3File:
             self.warnings.append(f"{path.name}-wal holds messages not yet in {path.name}: run sqlite3 {path.name} 'PRAGMA wal_checkpoint'")
         try:
             self._open()
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             self._salvage(one_line(error))
 
     def _connect(self) -> "closing[sqlite3.Connection]":
@@ -40,6 +42,10 @@ class Db3File:
         return closing(database)
 
     def _open(self) -> None:
+        with self.path.open("rb") as file:
+            page = int.from_bytes(file.read(18)[16:], "big")  # bytes; 1 means 65536
+        if page > 1 and self.path.stat().st_size % page:
+            raise sqlite3.DatabaseError("it is cut")  # in its last page, which SQLite itself does not notice
         with self._connect() as database:
             self._read_topics(database)
             self._count(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
@@ -51,7 +57,7 @@ class Db3File:
             with self._connect() as database:
                 self._read_topics(database)
                 found = [(number, time) for number, time, _ in self._rows(database, self._channels.keys())]
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             raise BadInputError(
                 f"{self.path.name}: nothing can be saved of this SQLite bag ({one_line(error)}): record it again"
             ) from error
@@ -79,7 +85,7 @@ class Db3File:
     def _schema_distro(database: sqlite3.Connection) -> str | None:
         try:
             row = database.execute("SELECT ros_distro FROM schema").fetchone()
-        except sqlite3.DatabaseError:
+        except _ERRORS:
             return None
         return one_line(row[0], 40) if row else None
 
@@ -92,7 +98,7 @@ class Db3File:
             for number, time, data in rows:
                 if isinstance(time, int) and isinstance(data, bytes):
                     yield number, time, data
-        except sqlite3.DatabaseError as error:
+        except _ERRORS as error:
             text = f"{self.path.name} breaks off ({one_line(error)})"
             if text not in self.warnings:
                 self.warnings.append(text)

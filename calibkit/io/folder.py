@@ -16,7 +16,7 @@ from calibkit.io import images
 from calibkit.io.source import Source, Stamps, TopicInfo, seconds_text
 
 _MAX_FILE = 2**30  # bytes of one image
-_NUMBER = re.compile(r"\d{1,20}(\.\d{1,9})?")
+_NUMBER = re.compile(r"[0-9]{1,20}(\.[0-9]{1,9})?")
 # A number is a time since 1970 in the unit that its size allows; smaller ones are counters (up to 1e8 s: March 1973).
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
 

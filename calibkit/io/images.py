@@ -1,6 +1,7 @@
 """All image decoding, to gray: raw ROS encodings, compressed messages, image files. Sizes are checked before allocation."""
 
 import io
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, cast
@@ -12,8 +13,10 @@ from PIL import Image
 from calibkit.errors import BadInputError, one_line
 from calibkit.opencv import cv2
 
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # MAX_PIXELS is checked instead
+
 Gray = NDArray[np.uint8] | NDArray[np.uint16]
-MAX_PIXELS = 150_000_000  # of one image; also below Pillow's own limit
+MAX_PIXELS = 150_000_000  # of one image; the largest sensors have as many, and Pillow refuses more than 178 million
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff"})
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 

@@ -96,6 +96,8 @@ class McapFile:
             if op == _CHUNK_INDEX:
                 first, _, position, _, index_size = _unpack("<QQQQI", data)
                 inside = {channel for channel, _ in struct.iter_unpack("<HQ", data[36 : 36 + index_size // 10 * 10])}
+                if position >= self._size:
+                    raise Damage("its summary points beyond its end")
                 self._chunks[Chunk(first, position)] = frozenset(inside)
             elif op == _STATISTICS:
                 chunked = _unpack("<QHIIII", data)[5] > 0 or _unpack("<Q", data)[0] == 0
@@ -140,14 +142,9 @@ class McapFile:
 
     def _read_chunk(self, file: BinaryIO, position: int, wanted: Collection[int] | None = None) -> list[_Found]:
         """Return the messages of the chunk (or the one message) at a position, as far as it is whole."""
-        file.seek(position)
-        op, length = _unpack("<BQ", file.read(9))
-        if length > MAX_CHUNK:
-            raise BadInputError(self._too_large(position, length))
-        data = file.read(length)
         found: list[_Found] = []
         try:
-            inside = self._unpack_chunk(data, position, cut=len(data) < length) if op == _CHUNK else struct.pack("<BQ", op, length) + data
+            inside = self._unpack_chunk(file, position)
             at = 0
             while at < len(inside):
                 op, length = _unpack("<BQ", inside, at)
@@ -167,19 +164,30 @@ class McapFile:
                 self.warnings.append(text)
         return found
 
-    def _unpack_chunk(self, data: bytes, position: int, cut: bool) -> bytes:
+    def _unpack_chunk(self, file: BinaryIO, position: int) -> bytes:
+        """Return the records in a chunk, or the record itself where a message lies outside of chunks."""
+        file.seek(position)
+        head = file.read(9)
+        op, length = _unpack("<BQ", head)
+        self._refuse_large(position, length)
+        data = file.read(length)
+        if op != _CHUNK:
+            return head + data
         _, _, size, checksum = _unpack("<QQQI", data)
+        self._refuse_large(position, size)
         compression, at = _text(data, 28)
         (packed_size,) = _unpack("<Q", data, at)
-        if size > MAX_CHUNK:
-            raise BadInputError(self._too_large(position, size))
+        cut = len(data) < length
         inside = unpack(compression, data[at + 8 : at + 8 + packed_size], size, partial=cut)
         if checksum and not cut and zlib.crc32(inside) != checksum:
             raise Damage("its checksum is wrong")
         return inside
 
-    def _too_large(self, position: int, size: int) -> str:
-        return f"{self.path.name}: the chunk at byte {position} declares {size} bytes, more than {MAX_CHUNK}: record with smaller chunks"
+    def _refuse_large(self, position: int, size: int) -> None:
+        if size > MAX_CHUNK:
+            raise BadInputError(
+                f"{self.path.name}: the chunk at byte {position} declares {size} bytes, more than {MAX_CHUNK}: record with smaller chunks"
+            )
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         wanted = {number: channel for number, channel in self._channels.items() if channel.topic in topics}

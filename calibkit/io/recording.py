@@ -4,7 +4,6 @@ Nothing is read before it is asked for; what had to be mended is told in `warnin
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,23 +16,18 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import ros_messages, tf_tree
 from calibkit.io.board_corners import board_views
-from calibkit.io.csv_streams import csv_source
-from calibkit.io.folder import asl_camera, image_folder, is_asl_camera, is_image
-from calibkit.io.ros2_folder import METADATA, is_bag_file, open_bag_file, open_folder
-from calibkit.io.ros_bag import bag_source
+from calibkit.io.open_source import open_sources
 from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo
 from calibkit.models.board import Board
 
 T = TypeVar("T")
-_TABLES = (".csv", ".txt", ".tum")
-_SENSORS = "cam0/, imu0/ with data.csv inside"
 
 
 class Recording:
     """Topics of one or several sources on one clock, and their messages as observations."""
 
     def __init__(self, sources: list[Source]) -> None:
-        self._sources = sources
+        self._sources = sorted(sources, key=lambda source: source.start_ns)
         merged: dict[str, TopicInfo] = {}
         for topic in (topic for source in sources for topic in source.topics):
             known = merged.get(topic.name)
@@ -154,59 +148,4 @@ def open_recording(sources: list[Path], ros_distro: str | None = None) -> Record
     if not sources:
         raise BadInputError("no recording is given: name a .bag, .mcap, .db3, a folder or a CSV file")
     ros_messages.typestore(ros_distro)  # an unknown name is told before anything is read
-    opened = [source for path in sources for source in _open(Path(path), ros_distro)]
-    names = Counter(topic.name for source in opened for topic in source.topics)
-    if not names and not any(source.survey for source in opened):
-        raise BadInputError(f"{', '.join(source.name for source in opened)}: nothing in it can be read")
-    return Recording(opened)
-
-
-def _open(path: Path, distro: str | None) -> list[Source]:
-    name = one_line(path.name or path.resolve().name, 120)
-    try:
-        if path.is_dir():
-            return _open_folder(path, name, distro)
-        if not path.exists():
-            raise BadInputError(f"{one_line(path)} does not exist: give a recording (.bag, .mcap, .db3, a folder or CSV)")
-        if is_bag_file(path):
-            container = open_bag_file(path)
-            return [bag_source(name, [path], [container], _distro(getattr(container, "distro", None), distro), [])]
-        if path.suffix.lower() in _TABLES:
-            return [csv_source(path, name.rsplit(".", 1)[0])]
-    except OSError as error:
-        raise BadInputError(f"{one_line(path)} cannot be read ({one_line(error.strerror)})") from error
-    raise BadInputError(f"{name} is no recording that is known: give a .bag, .mcap, .db3, a folder of images, an ASL folder or CSV")
-
-
-def _open_folder(path: Path, name: str, distro: str | None) -> list[Source]:
-    files = sorted(path.iterdir())
-    if (path / METADATA).is_file() or any(is_bag_file(file) for file in files):
-        data, containers, stated, warnings = open_folder(path)
-        return [bag_source(name, data, containers, _distro(stated, distro), warnings)]
-    if (path / "mav0").is_dir():
-        path, files = path / "mav0", sorted((path / "mav0").iterdir())
-    found = [asl_camera(path, name)] if is_asl_camera(path) else []
-    found += [image_folder(path, name)] if any(map(is_image, files)) else []
-    refused = []
-    for entry in files:
-        table = entry / "data.csv" if entry.is_dir() else entry
-        topic = one_line(entry.stem, 120)
-        try:
-            if entry.is_dir() and is_asl_camera(entry):
-                found.append(asl_camera(entry, topic))
-            elif entry.is_dir() and any(map(is_image, entry.iterdir())):
-                found.append(image_folder(entry, f"{name}/{topic}"))
-            elif table.suffix.lower() in _TABLES and table.is_file() and not (entry == table and is_asl_camera(path)):
-                found.append(csv_source(table, topic))
-        except BadInputError as error:
-            refused.append(str(error))
-    if not found:
-        reason = refused[0] if refused else f"no images, no bag files, no CSV, no {_SENSORS}"
-        raise BadInputError(f"{name} holds nothing that can be read: {reason}")
-    for text in refused:
-        found[0].warn(text)
-    return found
-
-
-def _distro(stated: str | None, asked: str | None) -> str | None:
-    return stated if stated and ros_messages.known_distro(stated) else asked
+    return Recording(open_sources(sources, ros_distro))

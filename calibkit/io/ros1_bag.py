@@ -86,7 +86,9 @@ class Ros1Bag:
             with path.open("rb") as file:
                 self._open(file)
         except Damage as damage:
-            raise BadInputError(f"{path.name}: nothing can be saved of this bag ({damage}): record it again") from damage
+            raise BadInputError(
+                f"{path.name}: nothing can be saved of this bag ({'; '.join([str(damage), *self.warnings])}): record it again"
+            ) from damage
         self.start_ns = min((chunk.start_ns for chunk in self._chunks), default=0)
 
     def _open(self, file: BinaryIO) -> None:
@@ -127,8 +129,10 @@ class Ros1Bag:
                 self._add_connection(fields, data)
             elif op == _CHUNK_INFO:
                 inside = dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
-                start = _time(fields, b"start_time") if inside else 0
-                self._chunks[Chunk(start, _number(fields, b"chunk_pos", 8))] = frozenset(inside)
+                chunk = Chunk(_time(fields, b"start_time") if inside else 0, _number(fields, b"chunk_pos", 8))
+                if chunk.position >= self._size:
+                    raise Damage("its index points beyond its end")
+                self._chunks[chunk] = frozenset(inside)
                 counts.update(inside)
         return counts
 
@@ -159,19 +163,9 @@ class Ros1Bag:
 
     def _read_chunk(self, file: BinaryIO, position: int, wanted: Collection[int] | None = None) -> list[tuple[int, int, bytes]]:
         """Return connection, record time and payload of the messages in a chunk, as far as it is whole."""
-        file.seek(position)
-        fields, length = _record(file, self._size)
-        declared = _number(fields, b"size")
-        if max(declared, length) > MAX_CHUNK:
-            raise BadInputError(
-                f"{self.path.name}: the chunk at byte {position} declares {max(declared, length)} bytes, more than {MAX_CHUNK}: "
-                "record with smaller chunks (rosbag record --chunksize)"
-            )
-        packed = file.read(length)
         messages = []
         try:
-            data = unpack(fields.get(b"compression", b"").decode(errors="replace"), packed, declared, partial=len(packed) < length)
-            for header, body in _records(data):
+            for header, body in _records(self._unpack_chunk(file, position)):
                 op, connection = _number(header, b"op", 1), _number(header, b"conn")
                 if op == _CONNECTION and connection not in self._connections:
                     self._add_connection(header, body)
@@ -182,6 +176,18 @@ class Ros1Bag:
             if text not in self.warnings:
                 self.warnings.append(text)
         return messages
+
+    def _unpack_chunk(self, file: BinaryIO, position: int) -> bytes:
+        file.seek(position)
+        fields, length = _record(file, self._size)
+        declared = _number(fields, b"size")
+        if max(declared, length) > MAX_CHUNK:
+            raise BadInputError(
+                f"{self.path.name}: the chunk at byte {position} declares {max(declared, length)} bytes, more than {MAX_CHUNK}: "
+                "record with smaller chunks (rosbag record --chunksize)"
+            )
+        packed = file.read(length)
+        return unpack(fields.get(b"compression", b"").decode(errors="replace"), packed, declared, partial=len(packed) < length)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         wanted = {connection: channel for connection, channel in self._connections.items() if channel.topic in topics}

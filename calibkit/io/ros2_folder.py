@@ -29,18 +29,23 @@ _MAX_RATIO = 200  # of a packed file; rosbag2's own are below 20
 
 def is_bag_file(path: Path) -> bool:
     """Tell by its name whether a file is a bag, packed or not."""
-    return (Path(path.stem) if path.suffix in PACKED else path).suffix in BAG_FILES
+    return _kind(path) in BAG_FILES and path.is_file()
+
+
+def _kind(path: Path) -> str:
+    """Return .bag, .mcap or .db3 of a file that may be packed, or be a .bag.active that was never closed."""
+    return (Path(path.stem) if path.suffix in (*PACKED, ".active") else path).suffix.lower()
 
 
 def open_bag_file(path: Path) -> Container:
     """Open one .bag, .mcap or .db3; a packed one is unpacked to a temporary file that goes with the container."""
     if path.suffix not in PACKED:
-        return BAG_FILES[path.suffix](path)
+        return BAG_FILES[_kind(path)](path)
     folder = Path(tempfile.mkdtemp(prefix="calibkit-"))
     try:
         unpacked = folder / path.stem
         _unpack_file(path, unpacked)
-        container = BAG_FILES[unpacked.suffix](unpacked)
+        container = BAG_FILES[_kind(path)](unpacked)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -71,7 +76,7 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
     files = [path for path in listed if path.is_file()]
     if missing := [path.name for path in listed if path not in files]:
         warnings.append(f"{folder.name}: {len(missing)} files of {METADATA} are missing: {one_line(', '.join(missing), 120)}")
-    files = files or sorted(path for path in folder.iterdir() if path.is_file() and is_bag_file(path))
+    files = files or sorted(path for path in folder.iterdir() if is_bag_file(path))
     containers, refused = [], []
     for path in files:
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
 from calibkit.data.progress import Progress
@@ -18,7 +19,10 @@ from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo, seco
 from calibkit.io.unpack import UnpackError, unpack_message
 
 T = TypeVar("T")
+Array = NDArray[np.float64]
+_ABSURD = 1e9  # in SI units
 _BATCH = 4096  # Imu messages decoded at once
+_END_OF_TIME = 2**62  # ns, in 2116: later record times are damage
 _PATIENCE = 10  # messages without a stamp to hold back until one has a stamp
 
 
@@ -60,11 +64,15 @@ class _Bag:
             for message in container.messages(topics):
                 seen += 1
                 try:
-                    yield message._replace(payload=unpack_message(message.payload))
+                    payload = unpack_message(message.payload)
                 except UnpackError:
+                    payload = None
+                if payload is None or not 0 <= message.record_ns < _END_OF_TIME:
                     broken += 1
+                else:
+                    yield message._replace(payload=payload)
             if broken:
-                self.source.warn(f"{container.path.name}: {broken} compressed messages are damaged and left out")
+                self.source.warn(f"{container.path.name}: {broken} messages are damaged and left out")
             if seen < claimed:
                 self.source.warn(f"{container.path.name} claims {claimed} messages of {_names(topics)} but holds {seen}")
             for warning in container.warnings:
@@ -103,7 +111,7 @@ class _Bag:
         lost = 0
         while batch := list(islice(stamped, _BATCH)):
             gyro, accel, whole = ros_messages.decode_imu([m.payload for _, m in batch], batch[0][1].channel.encoding)
-            whole &= np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+            whole &= plausible(gyro) & plausible(accel)
             lost += int(np.sum(~whole))
             times.append(np.array([t_ns for t_ns, _ in batch], np.int64)[whole])
             gyros.append(gyro[whole])
@@ -184,10 +192,17 @@ def pose_samples(rows: list[tuple[int, ros_messages.Pose]], child: str) -> tuple
     return unit_poses(t_ns, q, p, one_line(frames[0][0], 100), one_line(frames[0][1], 100) or child)
 
 
-def unit_poses(t_ns: np.ndarray[Any, np.dtype[np.int64]], q: Any, p: Any, parent: str, child: str) -> tuple[PoseSamples, int]:
+def plausible(values: Array) -> NDArray[np.bool_]:
+    """Tell which rows are finite and of a size that any sensor can mean; what damage leaves can be anything."""
+    rows: NDArray[np.bool_] = np.all(np.abs(values) < _ABSURD, axis=1)
+    return rows
+
+
+def unit_poses(t_ns: NDArray[np.int64], q: Array, p: Array, parent: str, child: str) -> tuple[PoseSamples, int]:
     """Return poses with quaternions made unit, leaving out those further than 10 % from it or not finite; and how many."""
-    norm = np.linalg.norm(q, axis=1)
-    good = np.isfinite(p).all(axis=1) & (np.abs(norm - 1) < 0.1)
+    good = plausible(p) & plausible(q)
+    norm = np.linalg.norm(np.where(good[:, None], q, 0), axis=1)
+    good &= np.abs(norm - 1) < 0.1
     return PoseSamples(t_ns[good], q[good] / norm[good, None], p[good], parent, child), int(np.sum(~good))
 
 
@@ -198,7 +213,7 @@ def _names(topics: Iterable[str]) -> str:
 
 def bag_source(name: str, files: list[Path], containers: list[Container], distro: str | None, warnings: list[str]) -> Source:
     """Return the topics of bag files and how to read them; `distro` is the ROS 2 distribution, where known."""
-    source = Source(name, files, warnings=list(warnings))
+    source = Source(name, files, min((c.start_ns for c in containers), default=0), warnings=list(warnings))
     bag = _Bag(containers, distro, source)
     counts: Counter[tuple[str, str, str]] = Counter()
     for container in containers:

@@ -87,6 +87,7 @@ class Source:
 
     name: str
     files: list[Path]
+    start_ns: int = 0  # of the first message, where known without reading all
     topics: list[TopicInfo] = field(default_factory=list)
     images: dict[str, Callable[[], Iterator[ImageFrame]]] = field(default_factory=dict)
     imu: dict[str, Callable[[], ImuSamples]] = field(default_factory=dict)

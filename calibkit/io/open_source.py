@@ -1,0 +1,78 @@
+"""What a path given as SOURCE is: a bag, a folder of images, an ASL folder, a folder of several of these, or CSV."""
+
+from collections import Counter
+from pathlib import Path
+
+from calibkit.errors import BadInputError, one_line
+from calibkit.io import ros_messages
+from calibkit.io.csv_streams import csv_source
+from calibkit.io.folder import asl_camera, image_folder, is_asl_camera, is_image
+from calibkit.io.ros2_folder import METADATA, is_bag_file, open_bag_file, open_folder
+from calibkit.io.ros_bag import bag_source
+from calibkit.io.source import Source
+
+_TABLES = (".csv", ".txt", ".tum")
+
+
+def open_sources(paths: list[Path], distro: str | None) -> list[Source]:
+    """Open all paths; folders and CSV files of one name are told apart by the folders that they lie in."""
+    absolute = [Path(path).absolute() for path in paths]
+    times = Counter(path.name for path in absolute if path.is_dir() or path.suffix.lower() in _TABLES)
+    names = [f"{path.parent.name}/{path.name}" if times[path.name] > 1 else path.name for path in absolute]
+    return [source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro)]
+
+
+def _open(path: Path, name: str, distro: str | None) -> list[Source]:
+    try:
+        if path.is_dir():
+            return _open_folder(path, name, distro)
+        if not path.is_file():
+            what = "is no regular file" if path.exists() else "does not exist"
+            raise BadInputError(f"{one_line(path)} {what}: give a recording (.bag, .mcap, .db3, a folder or CSV)")
+        if is_bag_file(path):
+            container = open_bag_file(path)
+            return [bag_source(name, [path], [container], _distro(getattr(container, "distro", None), distro), [])]
+        if path.suffix.lower() in _TABLES:
+            return [csv_source(path, name.rsplit(".", 1)[0])]
+    except OSError as error:
+        raise BadInputError(f"{one_line(path)} cannot be read ({one_line(error.strerror)})") from error
+    raise BadInputError(f"{name} is no recording that is known: give a .bag, .mcap, .db3, a folder of images, an ASL folder or CSV")
+
+
+def _open_folder(path: Path, name: str, distro: str | None) -> list[Source]:
+    entries = sorted(path.iterdir())
+    if (path / METADATA).is_file() or any(is_bag_file(entry) for entry in entries):
+        files, containers, stated, warnings = open_folder(path)
+        return [bag_source(name, files, containers, _distro(stated, distro), warnings)]
+    if is_asl_camera(path):
+        return [asl_camera(path, name)]
+    if (path / "mav0").is_dir():
+        entries = sorted((path / "mav0").iterdir())
+    found = [image_folder(path, name)] if any(map(is_image, entries)) else []
+    refused = []
+    for entry in entries:
+        try:
+            found += _open_entry(entry, name)
+        except BadInputError as error:
+            refused.append(str(error))
+    if not found:
+        reason = refused[0] if refused else "no images, no bag files, no CSV, no cam0/ or imu0/ with data.csv"
+        raise BadInputError(f"{name} holds nothing that can be read: {reason}")
+    for text in refused:
+        found[0].warn(text)
+    return found
+
+
+def _open_entry(entry: Path, name: str) -> list[Source]:
+    """Open what lies in a folder of several streams: a sensor's folder of ASL, a folder of images, CSV; nothing else."""
+    topic = one_line(entry.stem, 120)
+    table = entry / "data.csv" if entry.is_dir() else entry
+    if entry.is_dir() and is_asl_camera(entry):
+        return [asl_camera(entry, topic)]
+    if entry.is_dir() and any(map(is_image, entry.iterdir())):
+        return [image_folder(entry, f"{name}/{topic}")]
+    return [csv_source(table, topic)] if table.suffix.lower() in _TABLES and table.is_file() else []
+
+
+def _distro(stated: str | None, asked: str | None) -> str | None:
+    return stated if stated and ros_messages.known_distro(stated) else asked

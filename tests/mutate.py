@@ -91,7 +91,7 @@ def mutated(draw: st.DrawFn, text: str) -> bytes:
         if change == "drop":
             del node[last]
         elif change == "nasty":
-            node[last] = draw(st.sampled_from(NASTY))
+            node[last] = copy.deepcopy(draw(st.sampled_from(NASTY)))
         elif change == "swap":
             source = data
             for key in draw(st.sampled_from(places)):

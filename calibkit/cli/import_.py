@@ -19,6 +19,7 @@ def run(
     """Turn other tools' calibration files into one rig file."""
     import shlex
 
+    from calibkit.errors import one_line
     from calibkit.stages.convert import import_files
 
     command = shlex.join(["calibkit", "import", *map(str, files), "-o", str(out)])
@@ -27,4 +28,4 @@ def run(
         typer.echo(f"note: {note}", err=True)
     rig = outcome.rig
     counts = ((rig.cameras, "cameras"), (rig.imus, "IMUs"), (rig.transforms, "transforms"), (rig.time_offsets, "time offsets"))
-    typer.echo(f"{', '.join(f'{len(part)} {what}' for part, what in counts if part)} written to {out}")
+    typer.echo(f"{', '.join(f'{what} {len(part)}' for part, what in counts if part)} written to {one_line(out)}")

@@ -1,0 +1,118 @@
+"""`calibkit import` and `export` on the command line, and cameras that a format cannot hold."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rigs import LENSES, SIZES, camera, full_rig
+
+from calibkit.cli import main as cli
+from calibkit.data.rig import Rig
+from calibkit.estimation.model_conversion import convert, nearest
+from calibkit.io.rig_file import load_rig, save_rig
+from calibkit.models.cameras import CAMERAS
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_model_in_its_own_terms_is_exact(name: str) -> None:
+    model, params = CAMERAS[name], np.array(LENSES[name])
+    found = convert(model, params, SIZES[name], model)
+    assert found.worst_px < 1e-9
+    assert found.lost == 0
+    np.testing.assert_allclose(found.params, params, rtol=1e-6, atol=1e-9)
+
+
+def test_a_larger_model_without_its_extra_terms_is_held_exactly() -> None:
+    params = np.array([*LENSES["pinhole-radtan"], 0.0])
+    found = nearest(CAMERAS["pinhole-radtan5"], params, (752, 480), [CAMERAS["pinhole-equi"], CAMERAS["pinhole-radtan"]])
+    assert found.model.name == "pinhole-radtan"
+    assert found.worst_px < 1e-9
+    np.testing.assert_allclose(found.params, LENSES["pinhole-radtan"], rtol=1e-9)
+
+
+def test_the_error_that_is_said_is_the_error() -> None:
+    """Away from the fitted grid, too: no pixel of the image is off by more than a little over the figure."""
+    source, params, size = CAMERAS["pinhole-radtan5"], np.array(LENSES["pinhole-radtan5"]), SIZES["pinhole-radtan5"]
+    found = convert(source, params, size, CAMERAS["pinhole-radtan"])
+    uv = np.random.default_rng(0).uniform([0, 0], np.array(size) - 1.0, (5000, 2))
+    rays, valid = source.unproject(uv, params)
+    error = np.linalg.norm(found.model.project(rays, found.params).uv - uv, axis=-1)[valid]
+    assert 0.5 * found.worst_px < error.max() < 1.02 * found.worst_px
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(found.rms_px, rel=0.2)
+
+
+def test_what_a_pinhole_cannot_see_counts_as_lost() -> None:
+    wide = np.array([150.0, 150.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])  # 120 deg off the axis at the image's side
+    found = convert(CAMERAS["pinhole-equi"], wide, (640, 480), CAMERAS["pinhole-radtan"])
+    assert found.lost > 0.2
+
+
+def test_a_lossy_export_is_refused_unless_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rig(Rig(cameras={"cam0": camera("pinhole-radtan5")}), tmp_path / "rig.yaml")
+    export = ("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "out")
+    assert command(monkeypatch, *export) == 2
+    message = capsys.readouterr().err
+    assert "cam0: kalibr would hold pinhole-" in message
+    assert "instead of pinhole-radtan5, off by at most " in message
+    assert message.rstrip().endswith("pass --lossy to write it all the same")
+    assert not (tmp_path / "out").exists()
+    assert command(monkeypatch, *export, "--lossy") == 0
+    out = capsys.readouterr()
+    assert "note: cam0: written as pinhole-" in out.err
+    assert out.out == f"written: {tmp_path / 'out' / 'camchain.yaml'}\n"
+
+
+def test_a_conversion_below_a_tenth_of_a_pixel_is_said_and_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = camera("pinhole-radtan5")
+    near = entry.model_copy(update={"covariance": None, "parameters": {**entry.parameters, "k3": entry.parameters["p1"]}})  # k3 = 1e-4
+    save_rig(Rig(cameras={"cam0": near}), tmp_path / "rig.yaml")
+    assert command(monkeypatch, "export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "out") == 0
+    assert "note: cam0: written as pinhole-radtan instead of pinhole-radtan5, off by at most 0.0" in capsys.readouterr().err
+    assert yaml.safe_load((tmp_path / "out" / "camchain.yaml").read_text())["cam0"]["distortion_model"] == "radtan"
+
+
+def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    save_rig(full_rig(), tmp_path / "rig.yaml")
+    out = tmp_path / "out"
+    export = ("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", out)
+    assert command(monkeypatch, *export) == 0
+    assert command(monkeypatch, *export) == 2
+    assert "--force" in capsys.readouterr().err
+    assert command(monkeypatch, *export, "--force") == 0
+    bring = ("import", *sorted(out.iterdir()), "-o", tmp_path / "new.yaml")
+    assert command(monkeypatch, *bring) == 0
+    assert capsys.readouterr().out.endswith(f"cameras 2, IMUs 2, transforms 4, time offsets 2 written to {tmp_path / 'new.yaml'}\n")
+    assert command(monkeypatch, *bring) == 2
+    run = load_rig(tmp_path / "new.yaml").provenance[0]
+    assert run.stage == "import"
+    assert run.command.startswith("calibkit import ")
+    assert [entry.name for entry in run.inputs] == ["camchain.yaml", "imu.yaml", "imu1.yaml"]
+    assert all(entry.sha256 for entry in run.inputs)
+    capsys.readouterr()
+    for arguments, words in [
+        (("export", tmp_path / "rig.yaml", "--to", "vinyl", "-o", out), "--to vinyl: no such format; choose one of kalibr, ros, opencv"),
+        (("export", tmp_path / "absent.yaml", "--to", "ros", "-o", out), "absent.yaml: cannot be read"),
+        (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "rig.yaml"), "rig.yaml: is a file; give the name of a folder"),
+        (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "a" / "b"), "b: cannot be made"),
+        (("import", tmp_path / "rig.yaml", "-o", tmp_path / "x.yaml"), "is a rig file already"),
+        (("import", out, "-o", tmp_path / "x.yaml"), "out: is not a file"),
+        (("import", out / "imu.yaml", out / "imu.yaml", "-o", out / "no" / "x.yaml"), "its folder does not exist"),
+    ]:
+        assert command(monkeypatch, *arguments) == 2
+        message = capsys.readouterr().err
+        assert words in message
+        assert message.count("\n") == 1
+    assert not (tmp_path / "x.yaml").exists()

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
+from calibkit.detection.artwork import artwork
 from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.models.cameras import CAMERAS
 from calibkit.opencv import cv2
 from calibkit.simulation.camera import RenderStyle, SimCamera, place_board, random_board_poses
 from calibkit.simulation.corners import views_of_poses
-from calibkit.simulation.render import Renderer
+from calibkit.simulation.render import PAINTERS, Renderer
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ def fit_saddles(image: NDArray[np.uint8], start: Array, radius: int) -> Array:
 def test_saddle_points_lie_where_the_model_projects_them(camera: SimCamera, board: Board, field_px: float) -> None:
     rng = np.random.default_rng(0)
     renderer, errors = Renderer(camera, board, CLEAN), []
-    for T in random_board_poses(camera, board, 10, rng, fill=(0.8, 0.9)):
+    for T in random_board_poses(camera, board, 6, rng, fill=(0.8, 0.9)):
         _, truth = views_of_poses(camera, board, T[None], rng)
         uv = truth.uv
         neighbour = cKDTree(uv).query(uv, k=2)[0][:, 1]
@@ -140,3 +141,22 @@ def test_the_seed_decides_the_noise() -> None:
     first, again, other = (renderer.render(T, np.random.default_rng(s)) for s in (0, 0, 1))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    "board", [APRILGRID, Checkerboard(9, 6, 0.05, 0.04), Charuco(8, 5, 0.05, 0.037), Charuco(7, 6, 0.05, 0.037, legacy=True)]
+)
+def test_what_is_rendered_is_what_is_printed(board: Board) -> None:
+    texture, printed = PAINTERS[board.kind](board), artwork(board)
+    xy = np.random.default_rng(0).uniform(texture.outline[0], texture.outline[2], (4_000, 2))
+
+    def inside(boxes: Array) -> NDArray[np.bool_]:
+        return np.any(np.all((xy[:, None] > boxes[:, :2]) & (xy[:, None] < boxes[:, 2:]), axis=-1), axis=-1)
+
+    black = inside(printed.black) & ~inside(printed.white)
+    column, row = np.clip(np.floor((xy - texture.low) / texture.size).astype(int), 1, np.array(texture.levels[0].shape)[::-1] - 2).T
+    around = np.stack([texture.levels[0][row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    clear = np.ptp(around.astype(int), axis=0) == 0  # not on an edge
+    assert np.mean(clear) > 0.9
+    assert 0.2 < np.mean(black) < 0.8
+    assert np.array_equal(around[4][clear] == 0, black[clear])

@@ -1,8 +1,10 @@
 """Scenarios, faults and the simulate stage: geometry and clocks agree with each other, faults do what they say, files are whole."""
 
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -19,6 +21,8 @@ from calibkit.simulation.scenarios import SCENARIOS
 from calibkit.simulation.session import START_NS, Session, simulate_session, simulate_views
 from calibkit.simulation.truth import true_rig
 from calibkit.stages.simulate import simulate
+
+T = TypeVar("T")
 
 
 def session(name: str = "cam-imu", seed: int = 0) -> Session:
@@ -169,6 +173,19 @@ def test_raw_images_come_back_too(tmp_path: Path) -> None:
     frames = list(open_recording([done.bag]).images("/cam0/image_raw"))
     assert len(frames) == 10
     assert frames[0].decode().dtype == np.uint8
+
+
+def test_two_cameras_share_one_progress(tmp_path: Path) -> None:
+    finished = []
+
+    def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
+        yield from items
+        finished.append((what, total))
+
+    done = simulate("stereo-imu", tmp_path, duration_s=1.0, progress=progress)
+    assert finished == [("rendering", 20)]
+    recording = open_recording([done.bag])
+    assert [len(list(recording.images(f"/cam{i}/image_raw"))) for i in (0, 1)] == [10, 10]
 
 
 def test_zero_stamps_reach_the_file(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.opencv import cv2
 from calibkit.simulation.camera import RenderStyle, SimCamera
-from calibkit.simulation.texture import Canvas, Texture, make_texture
+from calibkit.simulation.texture import Canvas, Texture
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -18,20 +18,25 @@ _TAG_CELLS = 10  # Kalibr's tag: 6 data bits and two bits of border on each side
 _FAR = -1e6  # a texel that is on no board
 
 
+def _paint_marker(sheet: Canvas, picture: NDArray[Any], x: float, y: float, size: float) -> None:
+    """A black square with its smallest corner at x, y, and the white cells of the picture [along y, along x]."""
+    cell = size / len(picture)
+    sheet.rectangles([(x, y, x + size, y + size)])
+    white = np.argwhere(picture > 127)
+    sheet.rectangles(((x + j * cell, y + i * cell, x + (j + 1) * cell, y + (i + 1) * cell) for i, j in white), ink=-1.0)
+
+
 def paint_aprilgrid(board: AprilGrid) -> Texture:
     """Kalibr's print: tags with a two-bit border, and a black square wherever four gaps meet, the outer edge included."""
     tag, gap = board.tag_size, board.tag_size * board.spacing
-    step, cell, margin = tag + gap, tag / _TAG_CELLS, gap + tag / 2
+    step, margin = tag + gap, gap + tag / 2
     sheet = Canvas((-margin, -margin), (board.columns * step - gap + margin, board.rows * step - gap + margin))
     sheet.rectangles((c * step - gap, r * step - gap, c * step, r * step) for r in range(board.rows + 1) for c in range(board.columns + 1))
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     for t in range(board.rows * board.columns):
-        x, y = t % board.columns * step, t // board.columns * step
-        sheet.rectangles([(x, y, x + tag, y + tag)])
         # OpenCV's picture of a tag is Kalibr's turned by half: its first row lies at the smallest y, its first column at the largest x.
-        bits = dictionary.generateImageMarker(t, _TAG_CELLS, borderBits=2)[:, ::-1]
-        white = np.argwhere(bits > 127)
-        sheet.rectangles(((x + j * cell, y + i * cell, x + (j + 1) * cell, y + (i + 1) * cell) for i, j in white), ink=-1.0)
+        picture = dictionary.generateImageMarker(t, _TAG_CELLS, borderBits=2)[:, ::-1]
+        _paint_marker(sheet, picture, t % board.columns * step, t // board.columns * step, tag)
     return sheet.texture()
 
 
@@ -45,14 +50,20 @@ def paint_checkerboard(board: Checkerboard) -> Texture:
 
 
 def paint_charuco(board: Charuco) -> Texture:
-    """OpenCV's own picture of the board, its squares a whole number of texels wide, in a white frame of one square."""
+    """OpenCV's board: black and white squares, markers in the white ones where its layout has them, in a white frame of one square."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_size, board.marker_size, dictionary)
     layout.setLegacyPattern(board.legacy)
-    texels = 2560 // max(board.columns, board.rows)
-    picture = layout.generateImage((board.columns * texels, board.rows * texels), marginSize=0)
-    gray = np.pad(picture.astype(np.uint8), texels, constant_values=255)
-    return make_texture(gray, (-board.square_size, -board.square_size), board.square_size / texels)
+    s = board.square_size
+    sheet = Canvas((-s, -s), ((board.columns + 1) * s, (board.rows + 1) * s))
+    first = int(board.legacy and board.rows % 2 == 0)  # whether the square at the origin is white
+    squares = ((i, j) for i in range(board.rows) for j in range(board.columns) if (i + j) % 2 == first)
+    sheet.rectangles((j * s, i * s, (j + 1) * s, (i + 1) * s) for i, j in squares)
+    cells = dictionary.markerSize + 2
+    for marker, corners in zip(np.ravel(layout.getIds()), layout.getObjPoints(), strict=True):
+        picture = dictionary.generateImageMarker(int(marker), cells, borderBits=1)
+        _paint_marker(sheet, picture, float(corners[0][0]), float(corners[0][1]), board.marker_size)
+    return sheet.texture()
 
 
 def paint_circles(board: CircleGrid) -> Texture:

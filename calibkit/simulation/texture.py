@@ -62,17 +62,12 @@ class Canvas:
             dy = self.low[1] + (np.arange(rows.start, rows.stop) + 0.5) * self.size - y
             self.ink[rows, columns] += np.clip(0.5 + (radius - np.hypot(dx, dy[:, None])) / self.size, 0, 1)
 
-    def texture(self) -> Texture:
-        """Return what was painted, with its coarser levels (each texel the mean of four)."""
-        return make_texture(np.round(255 * (1 - np.clip(self.ink, 0, 1))).astype(np.uint8), self.low, self.size)
-
-
-def make_texture(gray: Gray, low: tuple[float, float], size: float, levels: int = 5) -> Texture:
-    """Return a texture from its finest raster; its edge is cut to whole texels of the coarsest level."""
-    step = 2 ** (levels - 1)
-    gray = gray[: gray.shape[0] // step * step, : gray.shape[1] // step * step]
-    pyramid = [gray]
-    for _ in range(levels - 1):
-        fine = pyramid[-1].astype(np.uint16)
-        pyramid.append(((fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2] + 2) // 4).astype(np.uint8))
-    return Texture(tuple(np.ascontiguousarray(level) for level in pyramid), low, size)
+    def texture(self, levels: int = 5) -> Texture:
+        """Return what was painted, with its coarser levels (each texel the mean of four), cut to whole texels of the coarsest."""
+        step = 2 ** (levels - 1)
+        rows, columns = (n // step * step for n in self.ink.shape)
+        pyramid = [np.round(255 * (1 - np.clip(self.ink[:rows, :columns], 0, 1))).astype(np.uint8)]
+        for _ in range(levels - 1):
+            fine = pyramid[-1].astype(np.uint16)
+            pyramid.append(((fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2] + 2) // 4).astype(np.uint8))
+        return Texture(tuple(pyramid), self.low, self.size)

@@ -48,7 +48,11 @@ def simulate(
     bag = out / f"{scenario.replace('-', '_')}{STORAGES[storage].suffix}"
     done = Simulated(session, bag, out / "target.yaml", out / "truth.yaml")
     _make_room(out, (done.bag, done.target, done.truth), force)
-    write_bag(bag, _streams(session, progress), storage)
+    images = sum(len(track.stamp_ns) for track in session.tracks)
+    # One count for all cameras: their streams are merged by time, and a terminal has room for one bar.
+    count = progress(range(images), "rendering", images)
+    write_bag(bag, _streams(session, count), storage)
+    next(count, None)  # past its end, so that the bar goes
     write_atomic(done.target, dump_target(session.board_told), overwrite=force)
     save_rig(true_rig(session, scenario, faults), done.truth, force)
     return done
@@ -82,7 +86,7 @@ def _make_room(out: Path, files: Sequence[Path], force: bool) -> None:
         raise BadInputError(f"{one_line(out)}: cannot be written ({one_line(error.strerror or error)}); give another folder") from None
 
 
-def _streams(session: Session, progress: Progress) -> list[Stream]:
+def _streams(session: Session, count: Iterator[int]) -> list[Stream]:
     streams = [
         Stream(
             track.camera.topic, "compressed" if session.scenario.jpeg_quality else "mono8", track.camera.name, _images(session, i, progress)
@@ -101,13 +105,13 @@ def _imu_samples(session: Session) -> Iterator[Sample]:
         yield Sample(int(session.imu_record_ns[k]), int(imu.t_ns[k]), ImuPayload(imu.gyro[k], imu.accel[k]))
 
 
-def _images(session: Session, index: int, progress: Progress) -> Iterator[Sample]:
+def _images(session: Session, index: int, count: Iterator[int]) -> Iterator[Sample]:
     track, quality = session.tracks[index], session.scenario.jpeg_quality
     renderer = Renderer(track.camera, session.scenario.board, session.scenario.style)
     rng = session.image_rng(index)
     light = rng.uniform(0, 2 * np.pi)
-    poses = session.T_cam_board(track)
-    for k, T_cam_board in enumerate(progress(poses, f"rendering {track.camera.name}", len(poses))):
+    for k, T_cam_board in enumerate(session.T_cam_board(track)):
+        next(count)
         image = renderer.render(T_cam_board, rng, light)
         payload = CompressedPayload("jpeg", encode_jpeg(image, quality)) if quality else image
         yield Sample(int(track.record_ns[k]), int(track.stamp_ns[k]), payload)

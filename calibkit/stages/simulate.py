@@ -87,12 +87,8 @@ def _make_room(out: Path, files: Sequence[Path], force: bool) -> None:
 
 
 def _streams(session: Session, count: Iterator[int]) -> list[Stream]:
-    streams = [
-        Stream(
-            track.camera.topic, "compressed" if session.scenario.jpeg_quality else "mono8", track.camera.name, _images(session, i, progress)
-        )
-        for i, track in enumerate(session.tracks)
-    ]
+    kind = "compressed" if session.scenario.jpeg_quality else "mono8"
+    streams = [Stream(t.camera.topic, kind, t.camera.name, _images(session, i, count)) for i, t in enumerate(session.tracks)]
     if session.imu is not None and session.scenario.imu is not None:
         streams.append(Stream(session.scenario.imu.topic, "imu", session.scenario.imu.name, _imu_samples(session)))
     return streams

@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 G = 9.80665  # m/s^2
 
-_GAP = 2.5  # median intervals; above, samples are missing
+_GAP = 1.75  # median intervals; above, a sample or more is missing
+_DAY_S = 86400  # clocks further apart do not count from the same epoch
 _LONG_GAP_S = 0.2  # above, interpolation across a gap is a guess even for a hand-held rig
 _JITTER = 0.1  # robust sigma of the interval over its median
 _CLOCKS_S = 0.1  # latencies of two sensors differ by more: one clock is wrong
@@ -86,14 +87,10 @@ def check_headers(header_ns: Times, record_ns: Times) -> list[Finding]:
     latency = latency_s(header_ns, record_ns)
     if latency is None:
         return found
-    if abs(latency) > 1:
-        found.append(
-            Finding(
-                "other_clock", False, f"headers are {abs(latency):.6g} s {'before' if latency > 0 else 'after'} record times: another clock"
-            )
-        )
-    elif latency < -1e-3:
-        found.append(Finding("future_stamp", True, f"headers are {-latency * 1e3:.3g} ms after record times: stamped in the future"))
+    if -_DAY_S < latency < -1e-3:
+        found.append(Finding("future_stamp", True, f"headers are {-latency:.4g} s after record times: stamped in the future"))
+    elif abs(latency) > 1:
+        found.append(Finding("other_clock", False, f"headers and record times are {abs(latency):.6g} s apart: another clock"))
     late = (record_ns - header_ns)[header_ns != 0] * 1e-9
     third = len(late) // 3
     duration = float(np.ptp(record_ns)) * 1e-9
@@ -172,16 +169,25 @@ def check_gyro_unit(t_ns: Times, gyro: Array, accel: Array, window_s: float = 0.
     return []
 
 
+def _clipped(column: Array, top: float) -> int:
+    """Return how many samples sit at the extreme `top`, where that is clipping; else 0.
+
+    Clipped: runs of 3 or more, and 5 times as many as at any of the next three values inside. The rounded top of a smooth,
+    quantised peak holds at most 1 / (sqrt(2) - 1) = 2.4 times as many as the level below it.
+    """
+    levels, counts = np.unique(-np.abs(column - top), return_counts=True)
+    at = column == top
+    runs = np.diff(np.flatnonzero(np.diff(at, prepend=False, append=False)))[::2]
+    clear = len(levels) > 3 and counts[-1] >= 5 * counts[-4:-1].max()
+    return int(counts[-1]) if clear and runs.max() >= 3 else 0
+
+
 def check_saturation(name: str, values: Array) -> list[Finding]:
-    """Find axes that stay at their extreme for 3 samples or more, as a clipped signal does and a quantised one hardly."""
-    clipped = []
-    for axis, column in zip("xyz", values.T, strict=True):
-        for extreme in (column.min(initial=0), column.max(initial=0)):
-            at = column == extreme
-            runs = np.diff(np.flatnonzero(np.diff(at, prepend=False, append=False)))[::2]
-            # A signal of few levels (a quantised sensor at rest) sits at its extreme by chance.
-            if len(runs) and runs.max() >= 3 and len(np.unique(column)) > 100:
-                clipped.append(f"{axis} at {extreme:.6g} ({np.sum(at)} samples)")
+    """Find axes that are clipped at their highest or lowest value."""
+    if not len(values):
+        return []
+    ends = [(axis, column, top) for axis, column in zip("xyz", values.T, strict=True) for top in (column.min(), column.max())]
+    clipped = [f"{axis} at {top:.6g} ({count} samples)" for axis, column, top in ends if (count := _clipped(column, top))]
     return [Finding("saturation", True, f"{name} is clipped: {', '.join(clipped)}")] if clipped else []
 
 

@@ -40,7 +40,7 @@ def restamp(messages: Iterable[tuple[int, int, T]], zeros: list[int]) -> Iterato
             held.append((record, item))
         else:
             difference = header - record
-        if difference is not None or len(held) > _PATIENCE:
+        if held and (difference is not None or len(held) > _PATIENCE):
             yield from ((time + (difference or 0), waiting) for time, waiting in held)
             held.clear()
         if header != 0:
@@ -70,7 +70,7 @@ class _Bag:
                 if payload is None or not 0 <= message.record_ns < _END_OF_TIME:
                     broken += 1
                 else:
-                    yield message._replace(payload=payload)
+                    yield message if payload is message.payload else message._replace(payload=payload)
             if broken:
                 self.source.warn(f"{container.path.name}: {broken} messages are damaged and left out")
             if seen < claimed:

@@ -118,9 +118,11 @@ def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask)
     corner = np.flatnonzero(np.repeat(fitted.any(1), 4))
     sure, side = fitted.reshape(-1)[corner], np.repeat(_sides(uv), 4)[corner]
     xy, start = xy.reshape(-1, 2)[corner], uv.reshape(-1, 2)[corner]
-    sure = sure & in_line(local_maps(xy, start, step)[1], _OUT_OF_LINE * side)
+    maps, misfit = local_maps(xy, start, step)
+    sure = sure & in_line(misfit, _OUT_OF_LINE * side)
     if not sure.all() and sure.sum() >= 8:
         start[~sure] = predict(xy[sure], start[sure], xy[~sure][:, None], step)[:, 0]
-    fit = symmetry(image, start, local_maps(xy, start, step)[0], min(_RADIUS, 0.6 * spacing))
+        maps, _ = local_maps(xy, start, step)
+    fit = symmetry(image, start, maps, min(_RADIUS, 0.6 * spacing))
     ok = fit.ok & in_line(local_maps(xy, fit.uv, step)[1], _OUT_OF_LINE * side)
     return Detection(corner[ok].astype(np.int32), fit.uv[ok], fit.sigma_px[ok])

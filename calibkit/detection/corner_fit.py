@@ -21,6 +21,7 @@ Smoothed = NDArray[np.float32]
 
 SMOOTHING_PX = 0.85  # Gaussian, before every fit: bilinear sampling of a sharper image errs by 0.01 px
 FLOOR_PX = 0.005  # sampling error that stays without any noise
+_KERNEL = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
 _MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
 _MIN_WINDOW_PX = 2.0
 _SHRINK = 0.5  # of a saddle window wider than that, each iteration
@@ -28,7 +29,7 @@ _SHRINK = 0.5  # of a saddle window wider than that, each iteration
 
 def smooth(image: Image) -> Smoothed:
     """Return the image as the fits want it: float32, Gaussian-smoothed."""
-    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX), np.float32)
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
 
 
 def sample(image: Smoothed, uv: Array) -> Array:

@@ -41,7 +41,11 @@ def homographies(xy: Array, uv: Array, weight: Array) -> Array:
     zero = np.zeros_like(p)
     rows = np.stack([np.concatenate([p, zero, -u[:, None] * p], axis=1), np.concatenate([zero, p, -v[:, None] * p], axis=1)], axis=1)
     products = (np.swapaxes(rows, 1, 2) @ rows).reshape(len(xy), 81)
-    H = np.linalg.eigh((weight @ products).reshape(-1, 9, 9))[1][:, :, 0].reshape(-1, 3, 3)
+    normal = (weight @ products).reshape(-1, 9, 9) + 1e-12 * np.eye(9)
+    # The last element may be 1: the centroid of what is seen never lies on the plane's horizon
+    H = np.concatenate([np.linalg.solve(normal[:, :8, :8], -normal[:, :8, 8:])[..., 0], np.ones((len(normal), 1))], axis=1).reshape(
+        -1, 3, 3
+    )
     back = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]])
     there = np.array([[1 / size, 0, -origin[0] / size], [0, 1 / size, -origin[1] / size], [0, 0, 1]])
     out: Array = back @ H @ there

@@ -53,6 +53,15 @@ def test_a_point_projects_to_the_same_pixel_after_the_round_trip(tmp_path: Path,
     np.testing.assert_array_equal(uv(load(tmp_path, dump_rig(rig))), uv(rig))
 
 
+def test_a_changed_copy_is_checked_before_it_is_written(tmp_path: Path) -> None:
+    rig = full_rig()
+    fx = rig.cameras["cam0"].parameters["fx"].model_copy(update={"value": math.nan})
+    bad = rig.cameras["cam0"].model_copy(update={"parameters": {**rig.cameras["cam0"].parameters, "fx": fx}})
+    with pytest.raises(ValueError, match="fx"):
+        save_rig(rig.model_copy(update={"cameras": {"cam0": bad}}), tmp_path / "rig.yaml")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_file_is_for_people() -> None:
     assert "      fx: {value: 458.654, unit: px, sigma: " in TEXT
     assert "    equation: p_cam0 = T_cam0_imu0 p_imu0\n" in TEXT

@@ -65,6 +65,7 @@ def _as_bad_input(document: Document, error: ValidationError) -> BadInputError:
 def dump_rig(rig: Rig) -> str:
     """Return the rig file's text: stable order, numbers exact, a comment at each section."""
     data = rig.model_dump(mode="json")
+    Rig.model_validate(data)  # a copy with changed fields was never checked, and garbage must not be written
     parts = []
     for key, value in data.items():
         if value in ({}, []):

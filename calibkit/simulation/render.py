@@ -163,8 +163,3 @@ class Renderer:
 def encode_jpeg(image: Gray, quality: int) -> bytes:
     """Return the image as a JPEG file."""
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
-
-
-def encode_png(image: Gray) -> bytes:
-    """Return the image as a PNG file."""
-    return bytes(cv2.imencode(".png", image)[1])

@@ -69,6 +69,7 @@ _WEIGHT = np.exp(-0.5 * (_HALF**2).sum(1))  # square root of the pair's weight
 _QUADRATIC = np.linalg.pinv(
     np.stack([np.ones(len(_WINDOW)), *_WINDOW.T, _WINDOW[:, 0] ** 2, _WINDOW[:, 0] * _WINDOW[:, 1], _WINDOW[:, 1] ** 2], axis=1)
 )
+_CURVATURE = np.linalg.pinv(np.stack([np.ones(len(_HALF)), _HALF[:, 0] ** 2, _HALF[:, 0] * _HALF[:, 1], _HALF[:, 1] ** 2], axis=1))
 
 
 def saddle(image: Smoothed, uv: Array, J: Array, iterations: int = 3) -> tuple[Array, NDArray[np.bool_]]:
@@ -140,12 +141,9 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, iterati
     residual = ((odd_part - (D @ step[..., None])[..., 0]) ** 2).sum(1)
     mean = ((first + second) @ _WEIGHT**2 / (2 * (_WEIGHT**2).sum()))[:, None]
     signal = ((first - mean) ** 2 + (second - mean) ** 2) @ _WEIGHT**2
-    ok = (
-        (residual < 0.5 * signal)
-        & (_to_border(image, uv) > _MIN_WINDOW_PX)
-        & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
-        & np.isfinite(uv).all(1)
-    )
+    _, a, b, c = ((first + second) @ _CURVATURE.T).T
+    ok = (4 * a * c < b * b) & (residual < 0.5 * signal) & np.isfinite(uv).all(1)  # a dark square's middle is symmetric too, but no saddle
+    ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
     return CornerFit(uv, _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok), ok)
 
 

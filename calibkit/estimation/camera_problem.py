@@ -153,43 +153,34 @@ class CameraProblem:
             return list(pool.map(one, chunks))
 
     def _normal_blocks(self, x: LensState, c: int, views: CameraViews, rows: slice) -> tuple[Array, float]:
-        """Return per view K K^T of its stacked K = [pose | rig | lens | residual] (columns, 2 n), and the cost."""
+        """Return per view the products G of its columns [pose | rig | lens | residual], and the cost."""
         weight, T_rig = views.weight[rows], x.T_cam_cam0[c]
-        T_board = x.T_cam0_board[views.instant[rows]]
-        T = T_rig @ T_board
+        T = T_rig @ x.T_cam0_board[views.instant[rows]]
         in_camera = se3.transform(T, self.points)
         projection = views.model.project(in_camera, x.lenses[c], jacobians=True)
         assert projection.J_point is not None
         assert projection.J_params is not None
         usable = (weight > 0) & projection.valid
-        r = np.where(usable[..., None], views.uv[rows] - projection.uv, 0.0) * weight[..., None]
-        loss, down = cauchy(r[..., 0] ** 2 + r[..., 1] ** 2, self.loss_scale)
+        r = np.where(usable, np.moveaxis(views.uv[rows] - projection.uv, -1, 0), 0.0) * weight
+        loss, down = cauchy(r[0] ** 2 + r[1] ** 2, self.loss_scale)
         # A corner that leaves the model's domain costs as much as one a whole image away: no gain in pushing it out.
         lost = (weight > 0) & ~projection.valid
         penalty, _ = cauchy((max(views.image_size) * weight[lost]) ** 2, self.loss_scale)
-        cost = float(np.sum(loss[usable]) + np.sum(penalty))
+        cost = float(np.sum(loss) + np.sum(penalty))
 
-        f, n = weight.shape
-        lens_size = len(x.lenses[c])
-        rig_size = 6 if c else 0
-        K = np.zeros((f, 6 + rig_size + lens_size + 1, 2, n))
-        w = np.where(usable, weight * np.sqrt(down), 0.0)
-        J_point = np.moveaxis(projection.J_point, (-2, -1), (0, 1))  # (2, 3, f, n)
-        J_lens = np.moveaxis(projection.J_params, (-2, -1), (0, 1))
-        R = T[:, :3, :3]
-        X = self.points.T
-        in_cam0 = se3.transform(T_board, self.points) if c else in_camera
-        for d in range(2):
-            a = J_point[d] * w  # (3, f, n), d uv / d p_cam
-            along = [a[0] * R[:, None, 0, k] + a[1] * R[:, None, 1, k] + a[2] * R[:, None, 2, k] for k in range(3)]
-            _rigid_columns(K[:, :6, d], along, (X[0], X[1], X[2]))
-            if c:
-                along = [a[0] * T_rig[0, k] + a[1] * T_rig[1, k] + a[2] * T_rig[2, k] for k in range(3)]
-                _rigid_columns(K[:, 6:12, d], along, (in_cam0[..., 0], in_cam0[..., 1], in_cam0[..., 2]))
-            K[:, 6 + rig_size : -1, d] = np.moveaxis(J_lens[d] * w, 0, 1)
-            K[:, -1, d] = r[..., d] * np.sqrt(down)
-        rows_of_K: Array = K.reshape(f, -1, 2 * n)
-        return rows_of_K @ np.swapaxes(rows_of_K, 1, 2), cost
+        # K (2, columns, f, n): a point moved in the camera frame by rho + phi x p, then the lens, then the residual.
+        down = np.sqrt(down)
+        w = np.where(usable, weight * down, 0.0)
+        K = np.empty((2, 6 + len(x.lenses[c]) + 1, *w.shape))
+        np.multiply(np.moveaxis(projection.J_point, (-2, -1), (0, 1)), w, out=K[:, :3])
+        p = np.moveaxis(in_camera, -1, 0)
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            np.subtract(p[i] * K[:, j], p[j] * K[:, i], out=K[:, 3 + k])
+        np.multiply(np.moveaxis(projection.J_params, (-2, -1), (0, 1)), w, out=K[:, 6:-1])
+        np.multiply(r, down, out=K[:, -1])
+        G = np.matmul(K.transpose(0, 2, 1, 3), K.transpose(0, 2, 3, 1)).sum(axis=0)
+        return _in_right_tangents(G, T, T_rig if c else None), cost
 
     def residuals(self, x: LensState, c: int) -> Residuals:
         """Return camera c's residuals in px at a state."""
@@ -202,8 +193,17 @@ class CameraProblem:
         return Residuals(px, seen, np.linalg.norm(in_camera, axis=-1), T[:, :3, 2])
 
 
-def _rigid_columns(K: Array, along: list[Array], X: tuple[Array, Array, Array]) -> None:
-    """Write the columns of a right perturbation T exp(rho, phi) of points X: d p / d rho = R, d p / d phi = -R hat(X)."""
-    for k in range(3):
-        K[:, k] = along[k]
-        K[:, 3 + k] = X[(k + 1) % 3] * along[(k + 2) % 3] - X[(k + 2) % 3] * along[(k + 1) % 3]
+def _in_right_tangents(G: Array, T: Array, T_rig: Array | None) -> Array:
+    """Return G (f, k, k) with its first six columns, motions of the point in the camera frame, turned into right perturbations.
+
+    T exp(d) moves the point by Ad(T) d; with T = T_rig T_board, a right perturbation of T_rig moves it by Ad(T_rig) d.
+    """
+    f, size = len(G), G.shape[-1]
+    shift = 0 if T_rig is None else 6
+    M = np.zeros((f, size, size + shift))
+    M[:, :6, :6] = se3.adjoint(T)
+    if T_rig is not None:
+        M[:, :6, 6:12] = se3.adjoint(T_rig)
+    M[:, np.arange(6, size), np.arange(6, size) + shift] = 1
+    turned: Array = np.swapaxes(M, 1, 2) @ G @ M
+    return turned

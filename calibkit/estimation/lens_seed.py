@@ -4,7 +4,7 @@ For every trial focal length the pixels become rays of the undistorted lens, and
 follows linearly from ray x (H X) = 0 (the DLT of Hartley and Zisserman, 4.1, on rays: it holds beyond 90 degrees too).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.solver.levenberg_marquardt import minimise
 
-_SCAN = np.geomspace(0.15, 12.0, 45)  # focal length over the image's half diagonal
+_SCAN = np.geomspace(0.15, 12.0, 30)  # focal length over the image's half diagonal
 _SCAN_VIEWS = 24
-_HYPOTHESES = 4
+_SCAN_CORNERS = 60
+_HYPOTHESES = 3
+_HOPELESS = 5.0  # times the best error: no start there
 _SEED_LOSS = 8.0  # px: wide enough to let a wrong lens pull itself straight, narrow enough to forget gross outliers
 
 
@@ -48,11 +50,11 @@ def poses_from_rays(rays: Array, usable: NDArray[np.bool_], points: Array) -> Po
     T = se3.make(R, t)
     predicted = se3.transform(T, points)
     predicted /= np.maximum(np.linalg.norm(predicted, axis=-1, keepdims=True), 1e-12)
-    angle = np.where(usable, np.linalg.norm(np.cross(predicted, rays), axis=-1), np.nan)
+    angle = np.where(usable, np.linalg.norm(np.cross(predicted, rays), axis=-1), np.inf)
     angle = np.where(usable & (np.sum(predicted * rays, axis=-1) < 0), 2.0, angle)
-    error = np.full(len(rays), np.inf)
-    error[good] = np.nanmedian(angle[good], axis=1)
-    return Poses(T, error)
+    count = usable.sum(axis=1)
+    median = np.take_along_axis(np.sort(angle, axis=1), (np.maximum(count, 1) // 2)[:, None], axis=1)[:, 0]
+    return Poses(T, np.where(good, median, np.inf))
 
 
 def poses_of_views(views: CameraViews, lens: Array, points: Array) -> Poses:
@@ -69,28 +71,37 @@ def seed_camera(views: CameraViews, points: Array) -> tuple[Array, Poses]:
     """
     width, height = views.image_size
     centre = ((width - 1) / 2, (height - 1) / 2)
-    few = _scan_views(views)
-    trials: list[tuple[float, int, Array, Poses]] = []
-    for focal in _SCAN * np.hypot(width, height) / 2:
-        lens = views.model.seed(float(focal), centre)
-        poses = poses_of_views(few, lens, points)
-        finite = np.isfinite(poses.error)
-        if finite.any():
-            trials.append((float(np.median(poses.error[finite])) * focal, len(trials), lens, poses))
-    if not trials:
+    few, few_points = _scan_views(views, points)
+    focals = _SCAN * np.hypot(width, height) / 2
+    lenses = [views.model.seed(float(focal), centre) for focal in focals]
+    rays, valid = (np.stack(each) for each in zip(*(views.model.unproject(few.uv, lens) for lens in lenses), strict=True))
+    found = poses_from_rays(rays.reshape(-1, *rays.shape[2:]), (valid & (few.weight > 0)).reshape(-1, valid.shape[-1]), few_points)
+    errors = found.error.reshape(len(focals), -1)
+    finite = np.isfinite(errors)
+    median = np.array([np.median(e[ok]) if ok.any() else np.inf for e, ok in zip(errors, finite, strict=True)])
+    T = found.T_cam_board.reshape(len(focals), -1, 4, 4)
+    ends = [_refine(few, few_points, lenses[i], Poses(T[i], errors[i])) for i in _valleys(median * focals)[:_HYPOTHESES]]
+    if not ends:
         raise NotConvergedError("no board pose fits any focal length: check that the target file describes the board in the images")
-    trials.sort(key=lambda trial: trial[:2])
-    ends = [_refine(few, points, lens, poses) for _, _, lens, poses in trials[:_HYPOTHESES]]
     lens, _ = min(ends, key=lambda end: end[1])
     return lens, poses_of_views(views, lens, points)
 
 
-def _scan_views(views: CameraViews) -> CameraViews:
-    """Pick views with many corners, spread over the recording."""
+def _valleys(scores: Array) -> list[int]:
+    """Return the local minima of the scan that are not hopeless, the lowest first."""
+    padded = np.concatenate([[np.inf], scores, [np.inf]])
+    lowest = np.isfinite(scores) & (scores <= padded[:-2]) & (scores <= padded[2:]) & (scores <= _HOPELESS * scores.min())
+    return sorted(np.flatnonzero(lowest).tolist(), key=lambda i: scores[i])
+
+
+def _scan_views(views: CameraViews, points: Array) -> tuple[CameraViews, Array]:
+    """Pick views with many corners, spread over the recording, and of large boards a part of the corners."""
+    some = slice(None, None, max(1, len(points) // _SCAN_CORNERS))
+    views = replace(views, uv=views.uv[:, some], weight=views.weight[:, some])
     count = (views.weight > 0).sum(axis=1)
     pick = [int(group[np.argmax(count[group])]) for group in np.array_split(np.arange(len(count)), min(_SCAN_VIEWS, len(count)))]
     weight = (views.weight[pick] > 0).astype(float)  # in px
-    return CameraViews(views.model, np.arange(len(pick)), views.uv[pick], weight, views.image_size)
+    return CameraViews(views.model, np.arange(len(pick)), views.uv[pick], weight, views.image_size), points[some]
 
 
 def _refine(views: CameraViews, points: Array, lens: Array, poses: Poses) -> tuple[Array, float]:
@@ -98,6 +109,6 @@ def _refine(views: CameraViews, points: Array, lens: Array, poses: Poses) -> tup
     keep = np.isfinite(poses.error)
     views = CameraViews(views.model, np.arange(keep.sum()), views.uv[keep], views.weight[keep], views.image_size)
     state = LensState((lens,), np.eye(4)[None], poses.T_cam_board[keep])
-    solution = minimise(CameraProblem(points, (views,), loss_scale=_SEED_LOSS), state, max_steps=25, tolerance=1e-4)
+    solution = minimise(CameraProblem(points, (views,), loss_scale=_SEED_LOSS), state, max_steps=20, tolerance=1e-3)
     usable = solution.x.lenses[0][:2].min() > 0 and np.isfinite(solution.cost)
     return solution.x.lenses[0], solution.cost if usable else np.inf

@@ -1,9 +1,11 @@
 """Pinhole with radial-tangential distortion: Brown (1966) with 4 or 5 coefficients, the rational model of OpenCV with 8."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from calibkit.models.cameras.base import Array, Mask, Projection, first_turning_point, planes
 
@@ -40,41 +42,22 @@ class PinholeRadtan:
         full[: len(params)] = params
         return np.array([1, full[4], full[5], full[8]]), np.array([1, full[9], full[10], full[11]])
 
-    def _max_r2(self, params: Array) -> float:
-        n, d = self._radial(params)
-        # d(r q)/dr has the sign of (n + 2 s n') d - 2 s n d', s = r2; q must not meet a pole either.
-        dn, dd = n[1:] * [1, 2, 3], d[1:] * [1, 2, 3]
-        growth = np.polynomial.polynomial.polymul(n, d)
-        growth = np.polynomial.polynomial.polyadd(growth, 2 * np.concatenate([[0.0], np.polynomial.polynomial.polymul(dn, d)]))
-        growth = np.polynomial.polynomial.polysub(growth, 2 * np.concatenate([[0.0], np.polynomial.polynomial.polymul(n, dd)]))
-        return min(first_turning_point(growth, _MAX_RADIUS**2), first_turning_point(d, _MAX_RADIUS**2))
-
     def project(self, points: Array, params: Array, jacobians: bool = False) -> Projection:
         X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
-        fx, fy, cx, cy, _, _, p1, p2 = params[:8]
-        n, d = self._radial(params)
+        fx, fy, cx, cy, *_ = params
         front = Z > 1e-9
         inverse_z = 1 / np.where(front, Z, 1.0)
         x, y = X * inverse_z, Y * inverse_z
-        xx, yy, xy = x * x, y * y, x * y
-        r2 = xx + yy
-        valid = front & (r2 < self._max_r2(params))
-        top = 1 + r2 * (n[1] + r2 * (n[2] + r2 * n[3]))
-        rational = self.coefficients == 8
-        inverse_bottom = 1 / (1 + r2 * (d[1] + r2 * (d[2] + r2 * d[3]))) if rational else 1.0
-        q = top * inverse_bottom
-        xd = q * x + 2 * p1 * xy + p2 * (r2 + 2 * xx)
-        yd = q * y + p1 * (r2 + 2 * yy) + 2 * p2 * xy
-        uv = np.moveaxis(np.stack([fx * xd + cx, fy * yd + cy]), 0, -1)
+        r2 = x * x + y * y
+        valid = front & (r2 < _max_r2(self, params.tobytes()))
+        q, inverse_bottom = self._radial_gain(r2, params)
+        xd, yd = _tangential(x, y, r2, q, params)
+        uv = np.empty((*x.shape, 2))
+        uv[..., 0], uv[..., 1] = fx * xd + cx, fy * yd + cy
         if not jacobians:
             return Projection(uv, valid)
 
-        dq = n[1] + r2 * (2 * n[2] + r2 * (3 * n[3]))  # dq/dr2
-        if rational:
-            dq = (dq - q * (d[1] + r2 * (2 * d[2] + r2 * (3 * d[3])))) * inverse_bottom
-        cross = 2 * (dq * xy + p1 * x + p2 * y)
-        a = q + 2 * dq * xx + 2 * p1 * y + 6 * p2 * x
-        b = q + 2 * dq * yy + 6 * p1 * y + 2 * p2 * x
+        a, cross, b = self._slopes(x, y, r2, q, inverse_bottom, params)
         point, J_point = planes(x.shape, 3)
         point[0, 0], point[0, 1] = fx * a * inverse_z, fx * cross * inverse_z
         point[1, 0], point[1, 1] = fy * cross * inverse_z, fy * b * inverse_z
@@ -83,8 +66,9 @@ class PinholeRadtan:
 
         par, J_params = planes(x.shape, 4 + self.coefficients)
         par[0, 0], par[1, 1], par[0, 2], par[1, 3] = xd, yd, 1, 1
-        par[0, 6], par[1, 6] = 2 * fx * xy, fy * (r2 + 2 * yy)
-        par[0, 7], par[1, 7] = fx * (r2 + 2 * xx), 2 * fy * xy
+        xy = 2 * x * y
+        par[0, 6], par[1, 6] = fx * xy, fy * (r2 + 2 * y * y)
+        par[0, 7], par[1, 7] = fx * (r2 + 2 * x * x), fy * xy
         fxx, fyy = fx * x * inverse_bottom, fy * y * inverse_bottom
         power = r2
         for order in range(3):  # k1, k2, k3 with the power of r2; k4.. the same times -q
@@ -94,35 +78,71 @@ class PinholeRadtan:
             power = power * r2
         return Projection(uv, valid, J_point, J_params)
 
+    def _radial_gain(self, r2: Array, params: Array) -> tuple[Array, Array | float]:
+        """Return q and 1 / its denominator."""
+        n, d = self._radial(params)
+        top = 1 + r2 * (n[1] + r2 * (n[2] + r2 * n[3]))
+        if self.coefficients < 8:
+            return top, 1.0
+        inverse_bottom = 1 / (1 + r2 * (d[1] + r2 * (d[2] + r2 * d[3])))
+        return top * inverse_bottom, inverse_bottom
+
+    def _slopes(self, x: Array, y: Array, r2: Array, q: Array, inverse_bottom: Array | float, params: Array) -> tuple[Array, Array, Array]:
+        """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy."""
+        n, d = self._radial(params)
+        p1, p2 = params[6:8]
+        dq = n[1] + r2 * (2 * n[2] + r2 * (3 * n[3]))  # dq/dr2
+        if self.coefficients == 8:
+            dq = (dq - q * (d[1] + r2 * (2 * d[2] + r2 * (3 * d[3])))) * inverse_bottom
+        cross = 2 * (dq * x * y + p1 * x + p2 * y)
+        return q + 2 * dq * x * x + 2 * p1 * y + 6 * p2 * x, cross, q + 2 * dq * y * y + 6 * p1 * y + 2 * p2 * x
+
     def unproject(self, uv: Array, params: Array) -> tuple[Array, Mask]:
-        fx, fy, cx, cy = params[:4]
-        target = (uv - np.array([cx, cy])) / np.array([fx, fy])
+        fx, fy, cx, cy, *_ = params
+        tx, ty = (uv[..., 0] - cx) / fx, (uv[..., 1] - cy) / fy
         n, d = self._radial(params)
         # Start on the radial map, inverted by a table up to its turning point; Newton then settles the tangential part.
-        radius = np.linspace(0, np.sqrt(self._max_r2(params)), 400)
-        s = radius**2
-        image = radius * np.polynomial.polynomial.polyval(s, n) / np.polynomial.polynomial.polyval(s, d)
-        distorted = np.linalg.norm(target, axis=-1)
-        scale = np.interp(distorted, image, radius) / np.where(distorted > 0, distorted, 1.0)
-        xy = target * np.where(distorted > 0, scale, 1.0)[..., None]
-        unit = np.concatenate([[1.0, 1.0, 0.0, 0.0], params[4:]])
-        inside = np.ones(xy.shape[:-1], bool)
+        max_r2 = _max_r2(self, params.tobytes())
+        radius = np.linspace(0, np.sqrt(max_r2), 400)
+        image = radius * polynomial.polyval(radius**2, n) / polynomial.polyval(radius**2, d)
+        distorted = np.hypot(tx, ty)
+        scale = np.where(distorted > 0, np.interp(distorted, image, radius) / np.where(distorted > 0, distorted, 1.0), 1.0)
+        x, y = tx * scale, ty * scale
         for _ in range(_NEWTON_STEPS):
-            p = self.project(np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1), unit, jacobians=True)
-            assert p.J_point is not None
-            J, error = p.J_point[..., :2], target - p.uv
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-            inside = p.valid & (np.abs(det) > 1e-12)
-            det = np.where(inside, det, 1.0)
-            step = np.stack(
-                [J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1], J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]],
-                axis=-1,
-            )
-            xy = xy + np.where(inside[..., None], step / det[..., None], 0.0)
-            if np.all(np.abs(error[inside]) < 1e-15):
+            r2 = x * x + y * y
+            q, inverse_bottom = self._radial_gain(r2, params)
+            xd, yd = _tangential(x, y, r2, q, params)
+            ex, ey = tx - xd, ty - yd
+            inside = r2 < max_r2
+            if np.all(~inside | ((np.abs(ex) < 1e-14) & (np.abs(ey) < 1e-14))):
                 break
-        rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-        back = self.project(rays, unit)
-        valid = back.valid & (np.max(np.abs(back.uv - target), axis=-1) < 1e-9)
-        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        return rays, valid
+            a, cross, b = self._slopes(x, y, r2, q, inverse_bottom, params)
+            det = a * b - cross * cross
+            gain = np.where(inside & (np.abs(det) > 1e-12), 1 / np.where(np.abs(det) > 1e-12, det, 1.0), 0.0)
+            x, y = x + (b * ex - cross * ey) * gain, y + (a * ey - cross * ex) * gain
+        r2 = x * x + y * y
+        xd, yd = _tangential(x, y, r2, self._radial_gain(r2, params)[0], params)
+        valid = (r2 < max_r2) & (np.abs(tx - xd) < 1e-9) & (np.abs(ty - yd) < 1e-9)
+        inverse_length = 1 / np.sqrt(1 + r2)
+        return np.stack([x * inverse_length, y * inverse_length, inverse_length], axis=-1), valid
+
+
+def _tangential(x: Array, y: Array, r2: Array, q: Array, params: Array) -> tuple[Array, Array]:
+    """Return x', y' = q (x, y) with the tangential part added."""
+    p1, p2 = params[6:8]
+    shift = 2 * (p1 * y + p2 * x)  # of both; what is left is p2 r2, p1 r2
+    return x * (q + shift) + p2 * r2, y * (q + shift) + p1 * r2
+
+
+@lru_cache(maxsize=16)  # asked for again for every chunk of points under the same lens
+def _max_r2(model: PinholeRadtan, params: bytes) -> float:
+    """Return r2 where the radial map stops growing, or meets a pole.
+
+    d(r q)/dr has the sign of (n + 2 s n') d - 2 s n d', with s = r2 and q = n(s) / d(s).
+    """
+    n, d = model._radial(np.frombuffer(params))
+    dn, dd = n[1:] * [1, 2, 3], d[1:] * [1, 2, 3]
+    growth = polynomial.polymul(n, d)
+    growth = polynomial.polyadd(growth, 2 * np.concatenate([[0.0], polynomial.polymul(dn, d)]))
+    growth = polynomial.polysub(growth, 2 * np.concatenate([[0.0], polynomial.polymul(n, dd)]))
+    return min(first_turning_point(growth, _MAX_RADIUS**2), first_turning_point(d, _MAX_RADIUS**2))

@@ -34,27 +34,24 @@ def detect(image: Image, board: AprilGrid) -> Detection:
     xy = (board.points[:, :2] / board.tag_size).reshape(-1, 4, 2)
     smoothed = smooth(image)
     for tags, corners in april_tags.seeds(to_8_bit(image)):
-        uv, fitted = _start(smoothed, xy, tags, corners)
-        if fitted.any():
-            uv, fitted = _grow(smoothed, xy, 1 + board.spacing, uv, fitted)
+        seed, seen = _read(smoothed, n, tags, corners)
+        if not seen.any():
+            continue
+        uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed, seen)
         if fitted.any(1).sum() >= 2:
             return _finish(smoothed, xy, board.spacing, uv, fitted)
     return NOTHING
 
 
-def _start(image: Smoothed, xy: Array, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
-    """Return the corners uv (t, 4, 2) that first guesses make known, and which (t, 4): tags whose code and place among the others hold."""
-    uv, fitted = np.zeros_like(xy), np.zeros(xy.shape[:2], bool)
-    on_board = tags < len(xy)
+def _read(image: Smoothed, n_tags: int, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
+    """Return the corners (t, 4, 2) of first guesses that hold up, four saddles and the code, NaN elsewhere; and which tags (t,) do."""
+    on_board = tags < n_tags
     tags, corners = tags[on_board], corners[on_board]
     corners, ok = _fit(image, corners, _WIDE)
     good = ok.all(1) & april_tags.verify(image, tags, corners)
-    tags, corners = tags[good], corners[good]
-    if len(tags) >= 2:
-        agree = _largest_agreement(xy[tags], corners)
-        tags, corners = tags[agree], corners[agree]
-    uv[tags], fitted[tags] = corners, True
-    return uv, fitted
+    seed, seen = np.full((n_tags, 4, 2), np.nan), np.zeros(n_tags, bool)
+    seed[tags[good]], seen[tags[good]] = corners[good], True
+    return seed, seen
 
 
 def _largest_agreement(xy: Array, corners: Array) -> Mask:
@@ -95,22 +92,48 @@ def _inside(image: Smoothed, corners: Array) -> Mask:
     return np.asarray(((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1))
 
 
-def _grow(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask) -> tuple[Array, Mask]:
-    """Add every tag that its known neighbours lead to, with three corners or more and its own code."""
+def _grow(image: Smoothed, xy: Array, step: float, seed: Array, seen: Mask) -> tuple[Array, Mask]:
+    """Return the corners uv (t, 4, 2) of all tags that the largest agreement of seeds leads to, and which (t, 4) were fitted.
+
+    Each tag next to known ones starts from its seed where that is near the place foretold, else from there.
+    """
+    uv, fitted = np.zeros_like(xy), np.zeros(xy.shape[:2], bool)
+    first = np.flatnonzero(seen)
+    if len(first) >= 2:
+        first = first[_largest_agreement(xy[first], seed[first])]
+    uv[first], fitted[first] = seed[first], True
     centre = xy.mean(1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
-    known: Mask = np.asarray(fitted.any(1), bool)
+    known: Mask = np.asarray(fitted.any(1))
     for reach, window in ((1.5, _NARROW), (1.5, _WIDE), (2.9, _WIDE)):  # the last leaps over tags that are hidden
         neighbour = apart < reach
         ask = np.flatnonzero(~known & neighbour[:, known].any(1))
         while len(ask):
-            corners, ok = _fit(image, predict(xy[fitted], uv[fitted], xy[ask], step), window)
-            good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask.astype(np.int32), corners)
+            corners, ok, good = _try(image, xy, step, uv, fitted, seed, ask, window)
             found = ask[good]
             uv[found], fitted[found] = corners[good], ok[good]
             known[found] = True
             ask = np.flatnonzero(~known & neighbour[:, found].any(1))  # tags with a new neighbour to lead to them
     return uv, fitted
+
+
+def _try(
+    image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp], window: float
+) -> tuple[Array, Mask, Mask]:
+    """Return the corners of tags `ask` (m, 4, 2), which of them (m, 4) are saddles, and which tags (m,) are there.
+
+    Where only the corners towards the known tags are found, they help to foretell the others once more.
+    """
+    uv, fitted = uv.copy(), fitted.copy()
+    for _ in range(2):
+        foretold = predict(xy[fitted], uv[fitted], xy[ask], step)
+        near = np.linalg.norm(seed[ask] - foretold, axis=-1).max(1) < _AGREE * _sides(foretold)  # NaN is not
+        corners, ok = _fit(image, np.where(near[:, None, None], seed[ask], foretold), window)
+        good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask.astype(np.int32), corners)
+        if good.all() or not ok[~good].any():
+            break
+        uv[ask], fitted[ask] = corners, ok
+    return corners, ok, good
 
 
 def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask) -> Detection:

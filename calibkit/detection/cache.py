@@ -11,6 +11,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -73,14 +74,20 @@ class CornerCache:
         self._quiet(self._finish)
         self._db = None
 
+    def __enter__(self) -> "CornerCache":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
     def _open(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         try:
             return self._connect()
-        except sqlite3.DatabaseError as error:
-            if isinstance(error, sqlite3.OperationalError):  # locked, read-only, full: not ours to mend
-                raise
-            self._path.unlink()  # not a database: it is a cache, start anew
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError:  # another kind of file, or a damaged one: it is only a cache
+            self._path.unlink()
             return self._connect()
 
     def _connect(self) -> sqlite3.Connection:
@@ -114,7 +121,12 @@ class CornerCache:
         with self._lock:
             try:
                 return work()
-            except (sqlite3.Error, OSError, ValueError, OverflowError):
+            except (sqlite3.OperationalError, OSError, ValueError, OverflowError):
+                return None  # locked, read-only, full
+            except sqlite3.Error:  # damaged: the next run starts anew
+                self._db = None
+                with suppress(OSError):
+                    self._path.unlink()
                 return None
 
 

@@ -65,6 +65,7 @@ class BoardViews:
     uv: Array  # (n, 2) px
     sigma_px: Array  # (n,) px per coordinate, as the detector judged it
     camera: str = "cam0"
+    sigma_bias_px: float = 0.0  # px per coordinate: the detector's error that stays the same at one place of the image, in every frame
     n_images: int = 0  # images looked at, those without a board included
     warnings: tuple[str, ...] = field(default=())
 
@@ -103,6 +104,7 @@ class BoardViews:
             uv=self.uv[rows],
             sigma_px=self.sigma_px[rows],
             camera=self.camera,
+            sigma_bias_px=self.sigma_bias_px,
             n_images=self.n_images,
             warnings=self.warnings,
         )

@@ -18,6 +18,7 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.models.board import Board
 from calibkit.opencv import cv2
 
+BIAS_PX = 0.005  # what the corner fit errs by, always the same where lens and perspective bend the pattern: rendered frames show 0.001-0.006
 _NAMED = 3  # broken images named one by one
 Outcome = tuple[int, str, "Entry | BadInputError"]  # stamp, label, what came of the frame
 
@@ -41,6 +42,7 @@ def find_boards(
         uv=np.concatenate([detection.uv for detection in found]),
         sigma_px=np.concatenate([detection.sigma_px for detection in found]),
         camera=camera,
+        sigma_bias_px=BIAS_PX,
         n_images=len(outcomes),
         warnings=_about_broken(broken, len(outcomes)),
     )

@@ -104,10 +104,7 @@ def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None
 
     With `lenses_of`, lenses and camera positions are held at that fit's and the poses alone are free.
     """
-    grids = [_rows(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
-    kept = _renumber(grids)
-    state = replace(fit.state, T_cam0_board=fit.state.T_cam0_board[kept])
-    problem = replace(fit.problem, cameras=tuple(grids))
+    problem, state = part_of(fit, frames)
     if lenses_of is not None:
         state = replace(state, lenses=lenses_of.state.lenses, T_cam_cam0=lenses_of.state.T_cam_cam0)
         problem = replace(problem, free_lens=False, free_rig=False)
@@ -121,6 +118,13 @@ def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None
         fit.dropped,
         solution.converged,
     )
+
+
+def part_of(fit: LensFit, frames: Sequence[Mask]) -> tuple[CameraProblem, LensState]:
+    """Return the problem and the state of some of the views of each camera."""
+    grids = [_rows(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
+    kept = _renumber(grids)
+    return replace(fit.problem, cameras=tuple(grids)), replace(fit.state, T_cam0_board=fit.state.T_cam0_board[kept])
 
 
 def instant_times(fit: LensFit) -> Array:

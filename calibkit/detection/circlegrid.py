@@ -32,5 +32,5 @@ def detect_circlegrid(image: Image, board: CircleGrid) -> Detection:
 
 def _blob_detector(largest: float) -> cv2.SimpleBlobDetector:
     parameters = cv2.SimpleBlobDetector.Params()
-    parameters.maxArea = largest
+    parameters.maxArea = max(largest, parameters.minArea)
     return cv2.SimpleBlobDetector.create(parameters)

@@ -18,7 +18,7 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.models.board import Board
 from calibkit.opencv import cv2
 
-BIAS_PX = 0.005  # what the corner fit errs by, always the same where lens and perspective bend the pattern: rendered frames show 0.001-0.006
+BIAS_PX = 0.005  # the corner fit errs alike wherever lens and perspective bend the pattern alike: 0.001-0.006 on rendered frames
 _NAMED = 3  # broken images named one by one
 Outcome = tuple[int, str, "Entry | BadInputError"]  # stamp, label, what came of the frame
 

@@ -14,6 +14,7 @@ from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
 from calibkit.report.view import Array, View, given, rms, views
 
+GOOD_RMS_PX = 0.3
 SIGNIFICANT = 4.0  # sigma below which structure is taken for chance
 COVERAGE_GRID = (8, 6)
 MIN_CORNERS = 3  # in a cell that counts as covered
@@ -122,7 +123,8 @@ def _worst_frame(view: View) -> Measured:
     worst = int(np.argmax(np.where(some, per_frame, -1)))
     middle = float(np.median(per_frame[some]))
     note = f"{view.labels[worst]}: {per_frame[worst]:.3g} {view.unit}, median {middle:.3g}"
-    return Measured(float(per_frame[worst]) / max(middle, 1e-12), note, exempt=some.sum() < 3)
+    harmless = some.sum() < 3 or per_frame[worst] <= GOOD_RMS_PX
+    return Measured(float(per_frame[worst]) / max(middle, 1e-12), note, exempt=bool(harmless))
 
 
 def _structure(found: Repeating, view: View) -> Measured:
@@ -190,7 +192,7 @@ def _tilt(view: View) -> Measured:
 _PIXELS = frozenset({"uv", "frame"})
 _IMAGE = _PIXELS | {"image_size"}
 PROBES = (
-    Probe("reprojection_rms", "reprojection rms", "px", 0.3, 1.0, frozenset({"uv"}), _rms,
+    Probe("reprojection_rms", "reprojection rms", "px", GOOD_RMS_PX, 1.0, frozenset({"uv"}), _rms,
           "corners are met badly: look for blur, a wrong board size or a wrong camera model"),
     Probe("held_out_ratio", "held-out rms over rms", "", 1.3, 3.0, frozenset({"uv", "held_out_rms"}), _held_out,
           "the model fits the frames it saw better than others: record more, and more varied, boards"),

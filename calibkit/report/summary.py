@@ -1,6 +1,6 @@
 """What a report says, before it is drawn: the verdict with its reasons, the parameter table and the signals; as text and as JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
@@ -52,13 +52,42 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
 
 def text(summary: Summary) -> str:
     """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
-    lines = [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
+    lines = [*camera_lines(summary), ""] if summary.rig.cameras else []
+    lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
     if summary.signals:
         head = [("sensor", "signal", "measured", "good", "")]
         lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))
     lines.append(f"{summary.verdict.value}")
     lines += [f"  {reason.verdict.value:5} {one_line(reason.text, 1000)}" for reason in summary.reasons]
     return "\n".join(lines)
+
+
+def camera_lines(summary: Summary) -> list[str]:
+    """Return what each camera's numbers rest on: model, frames, corners, rms, and how other models did."""
+    lines = []
+    for name, camera in summary.rig.cameras.items():
+        width, height = camera.resolution
+        text = f"{name}: {camera.model}, {width}x{height}"
+        r = camera.reprojection
+        if r is not None:
+            held_out = "" if r.held_out_rms_px is None else f", held-out {r.held_out_rms_px:.3g} px"
+            text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
+            text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
+        lines.append(one_line(text))
+        lines += [one_line(f"  held-out error by model: {scores}") for scores in _model_scores(summary, name)]
+    return lines
+
+
+def _model_scores(summary: Summary, camera: str) -> list[str]:
+    """Return the comparison of lens models that a stage has made for this camera."""
+    found = []
+    for result in summary.results:
+        models = result.facts.get("models")
+        scores = models.get(camera) if isinstance(models, Mapping) else None
+        if isinstance(scores, Mapping):
+            errors = {model: s.get("held_out_px") for model, s in scores.items() if isinstance(s, Mapping)}
+            found.append(", ".join(f"{model} {error:.3g} px" for model, error in errors.items() if isinstance(error, float)))
+    return [text for text in found if text]
 
 
 def _cells(row: Row) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The `calibkit` command: the table of subcommands and the one boundary where errors become a line and an exit code."""
 
+import os
 import sys
 import traceback
 from importlib import import_module
@@ -47,6 +48,9 @@ for _name in COMMANDS:
 
 def main() -> None:
     """Run the command line; each kind of error is one line on stderr and the exit code of SPEC section 6."""
+    # Our matrices are small and many: BLAS's own threads only get in each other's way. Read when numpy is first imported.
+    for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
     arguments = sys.argv[1:]
     try:
         code = app(_anywhere_first(arguments) or ["--help"], prog_name="calibkit", standalone_mode=False)

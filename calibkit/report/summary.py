@@ -74,7 +74,7 @@ def camera_lines(summary: Summary) -> list[str]:
             text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
             text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
         lines.append(one_line(text))
-        lines += [one_line(f"  held-out error by model: {scores}") for scores in _model_scores(summary, name)]
+        lines += [f"  held-out error by model: {one_line(scores)}" for scores in _model_scores(summary, name)]
     return lines
 
 

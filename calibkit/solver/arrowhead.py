@@ -57,7 +57,8 @@ class Arrowhead:
         A_B, A_g = solved[:, :, :-1], solved[:, :, -1]
         S = corner - np.tensordot(self.border, A_B, axes=([0, 1], [0, 1]))
         right = self.gradient_border - np.tensordot(self.border, A_g, axes=([0, 1], [0, 1]))
-        scale = 1 / np.sqrt(np.maximum(np.diag(S), np.finfo(float).tiny))
+        # By C and not by S: what the core wholly stands in for has rounding alone in S, which would be scaled up to 1.
+        scale = 1 / np.sqrt(np.maximum(np.diag(corner), np.finfo(float).tiny))
         dc = scale * np.linalg.lstsq(S * scale[:, None] * scale, right * scale, rcond=1e-15)[0]
         dx = A_g - A_B @ dc
         # 2 g.d - d.H d = g.d + damping d.diag(H) d; the last term is left out: a lower bound.

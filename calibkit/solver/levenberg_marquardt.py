@@ -9,8 +9,9 @@ from calibkit.solver.arrowhead import Array, Arrowhead
 
 X = TypeVar("X")
 
-_FIRST_DAMPING = 1e-4
+_FIRST_DAMPING = 1e-6
 _MAX_DAMPING = 1e12
+_NOTHING = 1e-23  # squared sigmas: perfect data has a cost of rounding alone, whose decrease no step can promise
 
 
 class Problem(Protocol[X]):
@@ -39,7 +40,7 @@ class Solution(Generic[X]):
 def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-11) -> Solution[X]:
     """Return a local minimum of the problem's cost from x.
 
-    Converged when a step promises to lower the cost by less than `tolerance` of it. A cost that is not finite at the start
+    Converged when a step promises to lower the cost by less than `tolerance` of it, or a billionth of a sigma. A cost that is not finite at the start
     gives an unconverged solution; the caller names the cause.
     """
     cost, system = problem.linearize(x)
@@ -52,7 +53,7 @@ def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 
         except np.linalg.LinAlgError:
             damping, growth = damping * growth, growth * 2
             continue
-        if promised <= tolerance * cost:
+        if promised <= tolerance * cost + _NOTHING:
             return Solution(x, cost, system, steps, True)
         trial = problem.retract(x, core, border)
         trial_cost, trial_system = problem.linearize(trial)

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Smoothed = NDArray[np.float32]
 
 SMOOTHING_PX = 0.85  # Gaussian, before every fit: bilinear sampling of a sharper image errs by 0.01 px
+_BLUR_PX2 = SMOOTHING_PX**2 + 0.35  # with what optics and pixels usually add
 FLOOR_PX = 0.005  # sampling error that stays without any noise
 _KERNEL = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
 _MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
@@ -147,7 +148,20 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
         (4 * a * c < b * b) & (b * bright >= 0) & (residual < 0.5 * signal) & np.isfinite(uv).all(1)
     )  # a dark square's middle is symmetric too, but no saddle
     ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
-    return CornerFit(uv, _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok), ok)
+    sigma = _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok)
+    return CornerFit(uv - _drawn_by_blur(maps), sigma, ok)
+
+
+def _drawn_by_blur(maps: LocalMaps) -> Array:
+    """Return by how much (n, 2) px blur has moved the corners: it draws a bent edge towards its centre of curvature by s^2 / 2 |bend|.
+
+    The edges run along the board's axes; an edge p(d) bends by n . p'' / |p'|^2 along its normal n, and both shifts hold at the corner.
+    """
+    along, bend = np.swapaxes(maps.J, 1, 2), maps.Q[:, [0, 2]]  # (n, edge, 2)
+    normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    shift = _BLUR_PX2 / 2 * np.sum(bend * normal, axis=-1, keepdims=True) / np.sum(along**2, axis=-1, keepdims=True)
+    out: Array = np.linalg.solve(normal, shift)[..., 0]
+    return out
 
 
 def _extent(metric: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from calibkit.data.rig import CONVENTIONS
 from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import draw
-from calibkit.report.summary import Summary, as_json
+from calibkit.report.summary import Summary, as_json, camera_lines
 from calibkit.version import __version__
 
 MEANING = {
@@ -35,6 +35,7 @@ def build(summary: Summary) -> dict[str, bytes]:
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
+        cameras=camera_lines(summary),
         meaning=MEANING[summary.verdict],
         sections=sections,
         thumbnails=thumbnails,

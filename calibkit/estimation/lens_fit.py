@@ -22,6 +22,7 @@ _OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
 _NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
 _BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
+_FINEST = 1e-6  # sigmas; perfect data leaves rounding alone, in which nothing stands out
 
 Mask = NDArray[np.bool_]
 
@@ -184,7 +185,7 @@ def _normalised(problem: CameraProblem, state: LensState, c: int, weight: Array)
 
 def _noise(problem: CameraProblem, state: LensState) -> float:
     norms = [z[seen] for z, seen in (_normalised(problem, state, c, v.weight) for c, v in enumerate(problem.cameras))]
-    return max(scale_of_norms(np.concatenate(norms)), 1e-9)
+    return max(scale_of_norms(np.concatenate(norms)), _FINEST)
 
 
 def _judge_views(
@@ -195,7 +196,7 @@ def _judge_views(
     for c, (views, grid) in enumerate(zip(used, problem.cameras, strict=True)):
         z, seen = _normalised(problem, state, c, found[c])
         scale = np.array([scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(z, seen, strict=True)])
-        typical = max(float(np.median(scale)), 1e-12)
+        typical = max(float(np.median(scale)), _FINEST)
         good = scale <= _BAD_VIEW * typical
         dropped += [
             DroppedView(views.camera, views.labels[i], f"its corners fit {scale[i] / typical:.0f} times worse than usual")
@@ -217,6 +218,6 @@ def _give_up_corners(problem: CameraProblem, state: LensState, found: list[Array
         noisier = np.max(np.where(grid.weight > 0, found[c] / np.where(grid.weight > 0, grid.weight, 1.0), 0.0), axis=1, keepdims=True)
         weight = found[c] / np.maximum(noisier, 1.0)
         z, seen = _normalised(problem, state, c, weight)
-        limit = _OUTLIER * scale_of_norms(z[seen])
+        limit = _OUTLIER * max(scale_of_norms(z[seen]), _FINEST)
         grids.append(replace(grid, weight=np.where(seen & (z <= limit), weight, 0.0)))
     return replace(problem, cameras=tuple(grids))

@@ -11,7 +11,7 @@ X = TypeVar("X")
 
 _FIRST_DAMPING = 1e-6
 _MAX_DAMPING = 1e12
-_NOTHING = 1e-23  # squared sigmas: perfect data has a cost of rounding alone, whose decrease no step can promise
+_NOTHING = 1e-22  # squared sigmas: the cost of perfect data is rounding alone, and no step lowers it
 
 
 class Problem(Protocol[X]):
@@ -40,8 +40,8 @@ class Solution(Generic[X]):
 def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-11) -> Solution[X]:
     """Return a local minimum of the problem's cost from x.
 
-    Converged when a step promises to lower the cost by less than `tolerance` of it, or a billionth of a sigma. A cost that is not finite at the start
-    gives an unconverged solution; the caller names the cause.
+    Converged when a step promises to lower the cost by less than `tolerance` of it, or by nothing. A cost that is not finite at the
+    start gives an unconverged solution; the caller names the cause.
     """
     cost, system = problem.linearize(x)
     damping, growth = _FIRST_DAMPING, 2.0

@@ -1,5 +1,6 @@
 """What a report says, before it is drawn: the verdict with its reasons, the parameter table and the signals; as text and as JSON."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
@@ -38,7 +39,7 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
     said = tuple(reason for result in results for reason in result.reasons)
     said += rig_reasons(rig, said)
     gone = [name for result in results for name in result.not_observable]
-    unsaid = [name for name in gone if not any(name in reason.text for reason in said)]
+    unsaid = [name for name in gone if not any(_says(reason, name) for reason in said)]
     said += tuple(Reason(Verdict.FAIL, f"not observable in this recording: {name}") for name in unsaid)
     said += not_good(signals)
     if not said:
@@ -48,6 +49,11 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
     order = list(Verdict)
     unique = sorted(dict.fromkeys(said), key=lambda reason: -order.index(reason.verdict))
     return Summary(rig, tuple(results), tuple(unique), tuple(rows(rig)), seen, signals)
+
+
+def _says(reason: Reason, name: str) -> bool:
+    """Whether a reason names this parameter (`cam0.fx`, `T_cam1_cam0`) as not observable."""
+    return "not observable" in reason.text and all(re.search(rf"\b{re.escape(part)}\b", reason.text) for part in name.split("."))
 
 
 def text(summary: Summary) -> str:

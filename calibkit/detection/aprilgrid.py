@@ -4,6 +4,8 @@ Each tag next to known ones is predicted by its neighbourhood (so that a lens ma
 verified. No tag is believed for its own sake: it must lie where its neighbours say, and carry its own code.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,35 +108,52 @@ def _grow(image: Smoothed, xy: Array, step: float, seed: Array, seen: Mask) -> t
     centre = xy.mean(1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
     known: Mask = np.asarray(fitted.any(1))
-    for reach, window in ((1.5, _NARROW), (1.5, _WIDE), (2.9, _WIDE)):  # the last leaps over tags that are hidden
+    asked = known.copy()
+    for reach in (1.5, 2.9):  # the second leaps over tags that are hidden
         neighbour = apart < reach
-        ask = np.flatnonzero(~known & neighbour[:, known].any(1))
+        ask = np.flatnonzero(~asked & neighbour[:, known].any(1))
         while len(ask):
-            corners, ok, good = _try(image, xy, step, uv, fitted, seed, ask, window)
-            found = ask[good]
-            uv[found], fitted[found] = corners[good], ok[good]
+            tried = _try(image, xy, step, uv, fitted, seed, ask)
+            asked[ask] = True
+            found = ask[tried.good]
+            uv[found], fitted[found] = tried.corners[tried.good], tried.ok[tried.good]
             known[found] = True
             ask = np.flatnonzero(~known & neighbour[:, found].any(1))  # tags with a new neighbour to lead to them
     return uv, fitted
 
 
-def _try(
-    image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp], window: float
-) -> tuple[Array, Mask, Mask]:
-    """Return the corners of tags `ask` (m, 4, 2), which of them (m, 4) are saddles, and which tags (m,) are there.
+@dataclass(frozen=True)
+class _Tried:
+    """What came of looking for tags at foretold places."""
 
-    Where only the corners towards the known tags are found, they help to foretell the others once more.
-    """
+    corners: Array  # (m, 4, 2)
+    ok: Mask  # (m, 4) saddles
+    good: Mask  # (m,) three saddles or more and the code
+
+
+def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp]) -> _Tried:
+    """Look for the tags `ask` (m,). Where only the corners towards the known tags are found, they help to foretell the others once more."""
     uv, fitted = uv.copy(), fitted.copy()
-    for _ in range(2):
-        foretold = predict(xy[fitted], uv[fitted], xy[ask], step)
-        near = np.linalg.norm(seed[ask] - foretold, axis=-1).max(1) < _AGREE * _sides(foretold)  # NaN is not
-        corners, ok = _fit(image, np.where(near[:, None, None], seed[ask], foretold), window)
-        good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask.astype(np.int32), corners)
-        if good.all() or not ok[~good].any():
+    m = len(ask)
+    out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool))
+    todo = np.arange(m)
+    for window in (_NARROW, _WIDE):
+        start = predict(xy[fitted], uv[fitted], xy[ask[todo]], step)
+        seeds, slack = seed[ask[todo]], _AGREE * _sides(start)
+        near = np.linalg.norm(seeds - start, axis=-1).max(1) < slack  # NaN is not
+        start = np.where(near[:, None, None], seeds, start)
+        in_view = ((start > -slack[:, None, None]) & (start < image.shape[::-1] + slack[:, None, None])).all((1, 2))
+        todo, start = todo[in_view], start[in_view]
+        if not len(todo):
             break
-        uv[ask], fitted[ask] = corners, ok
-    return corners, ok, good
+        corners, ok = _fit(image, start, window)
+        good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask[todo].astype(np.int32), corners)
+        out.corners[todo], out.ok[todo], out.good[todo] = corners, ok, good
+        uv[ask[todo]], fitted[ask[todo]] = corners, ok
+        todo = todo[~good]
+        if not len(todo):
+            break
+    return out
 
 
 def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask) -> Detection:

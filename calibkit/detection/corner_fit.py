@@ -23,6 +23,7 @@ SMOOTHING_PX = 0.85  # Gaussian, before every fit: bilinear sampling of a sharpe
 _BLUR_PX2 = SMOOTHING_PX**2 + 0.35  # with what optics and pixels usually add
 FLOOR_PX = 0.005  # sampling error that stays without any noise
 _KERNEL = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
+_MUCH_WORSE = 8.0  # than the frame's typical sigma: something else is in the window
 _MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
 _MIN_WINDOW_PX = 2.0
 _SHRINK = 0.5  # of a saddle window wider than that, each iteration
@@ -149,6 +150,8 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     )  # a dark square's middle is symmetric too, but no saddle
     ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
     sigma = _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok)
+    if ok.any():
+        ok &= sigma < _MUCH_WORSE * np.median(sigma[ok])
     return CornerFit(uv - _drawn_by_blur(maps), sigma, ok)
 
 

@@ -99,8 +99,9 @@ def test_fisheye_checkerboards(data_dir: Path) -> None:
     board = Checkerboard(9, 6, 0.12, 0.12)
     found = [detect(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), board) for path in sorted((data_dir / "mei_fisheye").glob("*.png"))]
     assert sum(len(d.corner) > 0 for d in found) >= 61
-    whole = [d.uv[:, None] for d in found if len(d.corner) == 54]
+    whole = [d.uv[None] for d in found if len(d.corner) == 54]
     K, k = np.array([[390.0, 0, 640], [0, 390, 480], [0, 0, 1]]), np.zeros(4)
-    flags = cv2.fisheye.CALIB_USE_INTRINSIC_GUESS | cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
-    rms, *_ = cv2.fisheye.calibrate([board.points[:, None]] * len(whole), whole, (1280, 960), K, k, flags=flags)
+    names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 5 has moved them
+    flags = names.CALIB_USE_INTRINSIC_GUESS | names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
+    rms, *_ = cv2.fisheye.calibrate([board.points[None]] * len(whole), whole, (1280, 960), K, k, flags=flags)
     assert rms <= 0.50

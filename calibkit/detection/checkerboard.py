@@ -1,7 +1,8 @@
 """Checkerboards and ChArUco boards: OpenCV finds which corner is which, the symmetry fit says where it is.
 
-A checkerboard looks the same turned by 180 degrees when rows + columns is even, and by 90 degrees when they are equal: its frame is then
-the finder's choice. Only tags (AprilGrid, ChArUco) or an odd sum settle it.
+Where the inner rows + columns of a checkerboard are odd, the square beyond its first corner is the black one of the two at its ends, and
+its frame is the same in every image. Where they are even it looks the same turned by 180 degrees, where they are equal by 90 degrees too:
+its frame is then the finder's choice, image by image. A lens does not mind; hand-eye and several cameras do: use an odd sum, or tags.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.detection.corner_fit import saddle, smooth, symmetry
+from calibkit.detection.corner_fit import saddle, sample, smooth, symmetry
 from calibkit.detection.found import NOTHING, Detection, Gray, Image, scaled_to, to_8_bit
 from calibkit.detection.plane_maps import in_line, local_maps
 from calibkit.errors import BadInputError
@@ -35,10 +36,24 @@ def detect_checkerboard(image: Image, board: Checkerboard) -> Detection:
         if uv is not None:
             corner = np.arange(board.columns * board.rows, dtype=np.int32)
             xy = np.stack([corner % board.columns, corner // board.columns], axis=-1).astype(float)
-            found = _refine(image, corner, xy, (uv + 0.5) / scale - 0.5, _RADIUS)
+            found = _refine(image, corner, xy, _turned(gray, xy, (uv + 0.5) / scale - 0.5, board), _RADIUS)
             if len(found.corner) >= _ENOUGH * len(corner):
                 return found
     return NOTHING
+
+
+def _turned(gray: Gray, xy: Array, uv: Array, board: Checkerboard) -> Array:
+    """Return the corners in the order that gives the board's frame: seen from the front, and from the black end where there is one."""
+    maps, _ = local_maps(xy, uv, _REACH)
+    if np.linalg.det(maps.J).sum() < 0:
+        uv = uv.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+        maps, _ = local_maps(xy, uv, _REACH)
+    across, down = maps.J[:, :, 0] / 2, maps.J[:, :, 1] / 2
+    image = gray.astype(np.float32)
+    diagonal = sample(image, uv - across - down) + sample(image, uv + across + down)
+    other = sample(image, uv - across + down) + sample(image, uv + across - down)
+    first_is_white = ((-1.0) ** xy.sum(1) * (diagonal - other)).sum() > 0
+    return uv[::-1] if first_is_white and (board.rows + board.columns) % 2 else uv
 
 
 def _classic(gray: Gray, size: tuple[int, int]) -> Array | None:

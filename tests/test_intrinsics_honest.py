@@ -1,0 +1,121 @@
+"""Sigmas that mean what they say: errors over many seeds in units of the claimed sigma, and OpenCV's sigmas on the same corners.
+
+`pytest -m slow -s tests/test_intrinsics_honest.py` prints the figures of docs/figures.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from lens_samples import LENSES, T_CAM1_CAM0, board_views, rig_views
+from scipy.stats import chi2
+
+from calibkit.data.observations import BoardViews
+from calibkit.estimation.camera_rig_seed import match_instants
+from calibkit.estimation.lens_fit import fit_lenses
+from calibkit.estimation.lens_trust import lens_covariance
+from calibkit.geometry import se3
+from calibkit.opencv import cv2
+from calibkit.simulation.camera import SimCamera
+from calibkit.simulation.scenarios import SCENARIOS
+from calibkit.simulation.session import simulate_session, simulate_views
+
+FRAMES = 40
+
+
+@dataclass(frozen=True)
+class Case:
+    """Cameras, cam0 first, and how a seed makes their views."""
+
+    cameras: tuple[SimCamera, ...]
+    views: Callable[[int], list[BoardViews]]
+
+
+def alone(model: str) -> Case:
+    return Case((LENSES[model],), lambda seed: [board_views(model, FRAMES, seed)])
+
+
+def moving() -> Case:
+    """30 s at 10 Hz before the board: neighbouring views are alike, and blocks of seconds hold many of them."""
+    scenario = SCENARIOS["aprilgrid"]
+    return Case(scenario.cameras, lambda seed: [simulate_views(simulate_session(scenario, seed))[0]])
+
+
+def pair() -> Case:
+    cameras = (LENSES["pinhole-radtan"], SCENARIOS["fisheye-imu"].cameras[0])
+    return Case(cameras, lambda seed: rig_views(list(cameras), [np.eye(4), T_CAM1_CAM0], FRAMES, seed))
+
+
+CASES = {
+    **{model: alone(model) for model in ("pinhole-radtan", "pinhole-radtan5", "pinhole-equi")},
+    "pinhole-radtan in motion": moving(),
+    "pinhole-radtan and pinhole-equi": pair(),
+}
+
+
+def normalised_errors(case: Case, seed: int) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Return names, (estimate - truth) / corrected sigma, and the same whitened by the full covariance, of one run."""
+    views = case.views(seed)
+    fit = fit_lenses(views, [camera.model.name for camera in case.cameras], match_instants(views))
+    names = [f"cam{c}.{name}" for c, camera in enumerate(case.cameras) for name in camera.model.parameter_names]
+    errors = [lens - camera.params for lens, camera in zip(fit.state.lenses, case.cameras, strict=True)]
+    if len(case.cameras) == 2:
+        names += [f"T_cam1_cam0.{axis}" for axis in ("rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z")]
+        errors.append(se3.local(T_CAM1_CAM0, fit.state.T_cam_cam0[1]))
+    error, cov = np.concatenate(errors), lens_covariance(fit).corrected
+    sigma = np.sqrt(np.diag(cov))
+    return names, error / sigma, np.linalg.solve(np.linalg.cholesky(cov / sigma / sigma[:, None]), error / sigma)
+
+
+def band(n: int) -> tuple[float, float]:
+    """Return the 99.9 % band of the rms of n normalised errors."""
+    low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], n) / n)
+    return float(low), float(high)
+
+
+def check(name: str, seeds: int, pooled_band: tuple[float, float]) -> None:
+    runs = [normalised_errors(CASES[name], seed) for seed in range(seeds)]
+    names, z, white = runs[0][0], np.array([run[1] for run in runs]), np.array([run[2] for run in runs])
+    rms, pooled = np.sqrt(np.mean(z**2, axis=0)), float(np.sqrt(np.mean(white**2)))
+    low, high = band(seeds)
+    each = " ".join(f"{n} {value:.2f}" for n, value in zip(names, rms, strict=True))
+    told = f"{name}, {seeds} seeds: pooled {pooled:.3f}; per parameter {rms.min():.2f} to {rms.max():.2f} of {low:.2f}-{high:.2f}: {each}"
+    print(told)
+    assert np.all((rms > low) & (rms < high)), told
+    assert pooled_band[0] < pooled < pooled_band[1], told
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_sigmas_are_honest_over_a_few_seeds(name: str) -> None:
+    count = 5 * sum(len(camera.params) for camera in CASES[name].cameras)
+    check(name, 5, band(count))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_sigmas_are_honest_over_thirty_seeds(name: str) -> None:
+    check(name, 30, (0.8, 1.25))
+
+
+@pytest.mark.parametrize(("model", "flags"), [("pinhole-radtan", cv2.CALIB_FIX_K3), ("pinhole-radtan5", 0)])
+def test_plain_sigmas_are_those_of_opencv(model: str, flags: int) -> None:
+    """cv2.calibrateCameraExtended says sqrt(diag((J^T J)^-1) s^2), s^2 = sum r^2 / (2 N - p) over N corners and p unknowns, as we do."""
+    views = board_views(model, 30, 0)
+    of_frame = [views.frame == f for f in range(views.n_frames)]
+    corners = [views.uv[rows].astype(np.float32) for rows in of_frame]
+    points = [views.board.points[views.corner[rows]].astype(np.float32) for rows in of_frame]
+    rms, K, distortion, _, _, deviations, *_ = cv2.calibrateCameraExtended(points, corners, views.image_size, None, None, flags=flags)
+    count = len(LENSES[model].params)
+    theirs, theirs_sigma = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion.ravel()])[:count], deviations.ravel()[:count]
+
+    fit = fit_lenses([views], [model], (np.arange(views.n_frames),), robust=False)
+    covariance = lens_covariance(fit)
+    ours_sigma = np.sqrt(np.diag(covariance.plain))
+    unknowns = count + 6 * views.n_frames
+    assert np.abs((fit.state.lenses[0] - theirs) / ours_sigma).max() < 0.02
+    # Each divided by its own variance factor: the sigmas of corners of 1 px.
+    factor = rms**2 * len(views.uv) / (2 * len(views.uv) - unknowns)
+    unit_of_ours = ours_sigma / np.sqrt(covariance.variance_factor) / views.sigma_px[0]
+    np.testing.assert_allclose(theirs_sigma / np.sqrt(factor), unit_of_ours, rtol=0.02)
+    np.testing.assert_allclose(theirs_sigma, ours_sigma, rtol=0.02)

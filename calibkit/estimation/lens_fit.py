@@ -13,7 +13,6 @@ from calibkit.estimation.camera_rig_seed import Instants, seed_rig
 from calibkit.estimation.lens_seed import seed_camera
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
-from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.levenberg_marquardt import minimise
 from calibkit.solver.robust import scale_of_norms
 
@@ -43,7 +42,6 @@ class LensFit:
     views: tuple[BoardViews, ...]  # of the views that took part
     problem: CameraProblem  # plain least squares, given-up corners with weight 0
     state: LensState
-    system: Arrowhead
     observed: tuple[Mask, ...]  # (f, n) per camera: corners found
     dropped: tuple[DroppedView, ...]
     converged: bool
@@ -118,7 +116,6 @@ def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None
         tuple(views.select(rows) for views, rows in zip(fit.views, frames, strict=True)),
         problem,
         solution.x,
-        solution.system,
         tuple(mask[rows] for mask, rows in zip(fit.observed, frames, strict=True)),
         fit.dropped,
         solution.converged,
@@ -176,7 +173,7 @@ def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dro
     if not np.isfinite(solution.cost):
         raise NotConvergedError(f"{names}: the solver found no minimum: check the target file, or try another --model")
     observed = tuple(weight > 0 for weight in found)
-    return LensFit(tuple(used), problem, solution.x, solution.system, observed, tuple(dropped), solution.converged)
+    return LensFit(tuple(used), problem, solution.x, observed, tuple(dropped), solution.converged)
 
 
 def _normalised(problem: CameraProblem, state: LensState, c: int, weight: Array) -> tuple[Array, Mask]:

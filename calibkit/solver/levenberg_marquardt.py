@@ -31,30 +31,30 @@ class Solution(Generic[X]):
     """Where the driver stopped."""
 
     x: X
-    cost: float
-    system: Arrowhead  # at x
+    cost: float  # before the last step, which changes it by less than the tolerance
     steps: int
     converged: bool
 
 
-def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-11) -> Solution[X]:
+def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-9) -> Solution[X]:
     """Return a local minimum of the problem's cost from x.
 
-    Converged when a step promises to lower the cost by less than `tolerance` of it, or by nothing. A cost that is not finite at the
-    start gives an unconverged solution; the caller names the cause.
+    Converged when a step that damping has not shortened promises to lower the cost by less than `tolerance` of it, or by nothing.
+    That step is still taken, unchecked: near the minimum its error is of second order. A cost that is not finite at the start gives
+    an unconverged solution; the caller names the cause.
     """
     cost, system = problem.linearize(x)
     damping, growth = _FIRST_DAMPING, 2.0
     for steps in range(max_steps):
         if not np.isfinite(cost) or damping > _MAX_DAMPING:
-            return Solution(x, cost, system, steps, False)
+            return Solution(x, cost, steps, False)
         try:
             core, border, promised = system.step(damping)
         except np.linalg.LinAlgError:
             damping, growth = damping * growth, growth * 2
             continue
         if promised <= tolerance * cost + _NOTHING:
-            return Solution(x, cost, system, steps, True)
+            return Solution(problem.retract(x, core, border), cost, steps, damping <= 1)
         trial = problem.retract(x, core, border)
         trial_cost, trial_system = problem.linearize(trial)
         gain = (cost - trial_cost) / promised
@@ -63,4 +63,4 @@ def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 
             damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
         else:
             damping, growth = damping * growth, growth * 2
-    return Solution(x, cost, system, max_steps, False)
+    return Solution(x, cost, max_steps, False)

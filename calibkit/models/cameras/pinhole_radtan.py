@@ -114,7 +114,7 @@ class PinholeRadtan:
             xd, yd = _tangential(x, y, r2, q, params)
             ex, ey = tx - xd, ty - yd
             inside = r2 < max_r2
-            if np.all(~inside | ((np.abs(ex) < 1e-14) & (np.abs(ey) < 1e-14))):
+            if np.all(~inside | ((np.abs(ex) < 1e-12) & (np.abs(ey) < 1e-12))):
                 break
             a, cross, b = self._slopes(x, y, r2, q, inverse_bottom, params)
             det = a * b - cross * cross

@@ -18,6 +18,7 @@ from calibkit.solver.levenberg_marquardt import minimise
 _SCAN = np.geomspace(0.15, 12.0, 30)  # focal length over the image's half diagonal
 _SCAN_VIEWS = 24
 _SCAN_CORNERS = 60
+_ENOUGH_CORNERS = 16
 _HYPOTHESES = 3
 _HOPELESS = 5.0  # times the best error: no start there
 _SEED_LOSS = 8.0  # px: wide enough to let a wrong lens pull itself straight, narrow enough to forget gross outliers
@@ -84,7 +85,16 @@ def seed_camera(views: CameraViews, points: Array) -> tuple[Array, Poses]:
     if not ends:
         raise NotConvergedError("no board pose fits any focal length: check that the target file describes the board in the images")
     lens, _ = min(ends, key=lambda end: end[1])
-    return lens, poses_of_views(views, lens, points)
+    some = _part_of_corners(points)
+    if (views.weight[:, some] > 0).sum(axis=1).min() < _ENOUGH_CORNERS:
+        some = slice(None)
+    part = replace(views, uv=views.uv[:, some], weight=views.weight[:, some])
+    return lens, poses_of_views(part, lens, points[some])
+
+
+def _part_of_corners(points: Array) -> slice:
+    """Pick a part of a large board's corners, spread over it: a start needs no more."""
+    return slice(None, None, max(1, len(points) // _SCAN_CORNERS))
 
 
 def _valleys(scores: Array) -> list[int]:
@@ -95,8 +105,8 @@ def _valleys(scores: Array) -> list[int]:
 
 
 def _scan_views(views: CameraViews, points: Array) -> tuple[CameraViews, Array]:
-    """Pick views with many corners, spread over the recording, and of large boards a part of the corners."""
-    some = slice(None, None, max(1, len(points) // _SCAN_CORNERS))
+    """Pick views with many corners, spread over the recording."""
+    some = _part_of_corners(points)
     views = replace(views, uv=views.uv[:, some], weight=views.weight[:, some])
     count = (views.weight > 0).sum(axis=1)
     pick = [int(group[np.argmax(count[group])]) for group in np.array_split(np.arange(len(count)), min(_SCAN_VIEWS, len(count)))]

@@ -15,13 +15,13 @@ Times = NDArray[np.int64]
 
 # What a topic of each kind is good for, as `calibkit info` tells it.
 USES = {
-    "image": "intrinsics (with --target), joint, handeye, timeoffset",
-    "imu": "allan, imu-intrinsics, joint, timeoffset",
-    "pose": "handeye, timeoffset",
-    "tf": "handeye, timeoffset (poses between two of its frames)",
-    "camera_info": "start value for intrinsics, or the intrinsics for other stages",
-    "corners": "intrinsics, joint (with --target)",
-    "cloud": "LiDAR stages, later",
+    "image": "intrinsics (with --target)",
+    "imu": "info; the IMU commands are yet to come",
+    "pose": "info; hand-eye and time offset are yet to come",
+    "tf": "info; hand-eye and time offset are yet to come",
+    "camera_info": "a driver's own calibration, to compare with",
+    "corners": "intrinsics (with --target and --resolution)",
+    "cloud": "nothing yet",
     "video": "nothing: video-coded images are not read; record sensor_msgs/CompressedImage (jpeg or png) instead",
     "other": "nothing",
 }

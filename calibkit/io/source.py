@@ -16,10 +16,10 @@ Times = NDArray[np.int64]
 # What a topic of each kind is good for, as `calibkit info` tells it.
 USES = {
     "image": "intrinsics (with --target)",
-    "imu": "info; the IMU commands are yet to come",
-    "pose": "info; hand-eye and time offset are yet to come",
-    "tf": "info; hand-eye and time offset are yet to come",
-    "camera_info": "a driver's own calibration, to compare with",
+    "imu": "allan, joint, timeoffset (yet to come)",
+    "pose": "handeye, timeoffset (yet to come)",
+    "tf": "handeye, timeoffset (yet to come)",
+    "camera_info": "the driver's own calibration, to compare with",
     "corners": "intrinsics (with --target and --resolution)",
     "cloud": "nothing yet",
     "video": "nothing: video-coded images are not read; record sensor_msgs/CompressedImage (jpeg or png) instead",

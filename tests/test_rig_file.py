@@ -252,7 +252,7 @@ def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, content: 
     rig = read_or_refused(lambda: load(tmp_path, content))
     if rig is not None:
         text = dump_rig(rig)
-        assert load(tmp_path, text) == rig
+        assert dump_rig(load(tmp_path, text)) == text  # not ==: an option may be nan
         assert not any(isinstance(x, float) and not math.isfinite(x) for x in _leaves(yaml.load(text, yaml.CSafeLoader)))
 
 

@@ -157,7 +157,7 @@ def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dro
         # From px-wide tolerance inwards: the noise is unknown until most corners fit.
         for _ in range(_ROBUST_ROUNDS):
             scale = _noise(problem, state)
-            solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=12, tolerance=1e-6)
+            solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x
             used, problem, state, found = _judge_views(used, problem, state, found, dropped)
         for _ in range(2):  # corners given up at the robust end may come back at the plain one

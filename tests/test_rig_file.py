@@ -117,6 +117,7 @@ def _twin(section: str, name: str, of: str) -> Change:
         (_set("conventions", "quaternion", "JPL"), "conventions.quaternion is not the convention"),
         (_set(*FX, "value", math.nan), "fx.value: input should be"),
         (_set(*FX, "value", math.inf), "fx.value: input should be"),
+        (_set("provenance", 0, "options", "value", math.nan), "provenance.0.options.value"),
         (_set(*FX, "value", "458.6"), "fx.value: input should be a valid number"),
         (_set(*FX, "value", True), "fx.value: input should be a valid number"),
         (_set(*FX, "value", None), "fx: a value is missing; only a parameter marked 'not observable'"),
@@ -252,7 +253,7 @@ def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, content: 
     rig = read_or_refused(lambda: load(tmp_path, content))
     if rig is not None:
         text = dump_rig(rig)
-        assert dump_rig(load(tmp_path, text)) == text  # not ==: an option may be nan
+        assert load(tmp_path, text) == rig
         assert not any(isinstance(x, float) and not math.isfinite(x) for x in _leaves(yaml.load(text, yaml.CSafeLoader)))
 
 

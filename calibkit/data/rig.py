@@ -213,7 +213,7 @@ class StageRun(Record):
     command: Text
     calibkit: Annotated[str, Field(max_length=40)]
     inputs: list[InputFile] = []
-    options: dict[str, str | float | int | bool | None] = {}
+    options: dict[str, str | Finite | int | bool | None] = {}
     residual_file: Text | None = None  # a bare name: the file lies beside the rig file
     residual_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
 

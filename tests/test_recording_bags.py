@@ -194,6 +194,20 @@ def test_a_claim_of_the_metadata_that_the_files_do_not_meet_is_told(tmp_path: Pa
     assert any("metadata.yaml is not readable" in w for w in recording.warnings)
 
 
+@pytest.mark.parametrize("names", ["5", "[metadata.yaml]", "[[a, b], {c: d}]", "[../other.mcap]", "[., ..]"])
+def test_a_list_of_files_that_is_none_leaves_the_files_of_the_folder(tmp_path: Path, names: str) -> None:
+    path = write(tmp_path, "mcap", _messages("mcap"))
+    (path / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{relative_file_paths: {names}, ros_distro: [1]}}")
+    assert len(open_recording([path]).imu("/imu").t_ns) == 40
+
+
+def test_a_metadata_file_that_grows_when_read_is_given_up(tmp_path: Path) -> None:
+    path = write(tmp_path, "mcap", _messages("mcap"))
+    rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+    (path / "metadata.yaml").write_text("\n".join([*rows, "rosbag2_bagfile_information: {relative_file_paths: [*a11]}"]))
+    assert any("holds more than" in w for w in open_recording([path]).warnings)
+
+
 @pytest.mark.parametrize("form", ["ros1", "ros1-bz2", "ros1-lz4", "mcap", "mcap-zstd", "db3"])
 def test_damaged_files_are_saved_or_refused_in_one_line(tmp_path: Path, form: str) -> None:
     path = write(tmp_path, form, _messages(form, 400))

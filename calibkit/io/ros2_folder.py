@@ -11,14 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Container
 from calibkit.io.db3 import Db3File
 from calibkit.io.mcap import McapFile
 from calibkit.io.ros1_bag import Ros1Bag
 from calibkit.io.unpack import zstd
+from calibkit.io.yaml_file import load_yaml
 
 BAG_FILES: dict[str, Callable[[Path], Container]] = {".bag": Ros1Bag, ".mcap": McapFile, ".db3": Db3File}
 PACKED = (".zstd", ".zst")
@@ -72,8 +71,9 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
     """Return data files, containers, ROS distribution (where stated) and warnings of a ROS 2 bag's folder."""
     warnings: list[str] = []
     metadata = _metadata(folder / METADATA, warnings)
-    listed = [folder / Path(str(name)).name for name in metadata.get("relative_file_paths") or []]
-    files = [path for path in listed if path.is_file()]
+    names = metadata.get("relative_file_paths")
+    listed = [folder / Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    files = [path for path in listed if is_bag_file(path)]
     if missing := [path.name for path in listed if path not in files]:
         warnings.append(f"{folder.name}: {len(missing)} files of {METADATA} are missing: {one_line(', '.join(missing), 120)}")
     files = files or sorted(path for path in folder.iterdir() if is_bag_file(path))
@@ -90,21 +90,23 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
     claimed = metadata.get("message_count")
     if isinstance(claimed, int) and claimed != held:
         warnings.append(f"{folder.name}: {METADATA} claims {claimed} messages, the data files hold {held}")
-    distro = metadata.get("ros_distro") or next((c.distro for c in containers if isinstance(c, Db3File) and c.distro), None)
+    stated = [metadata.get("ros_distro"), *(c.distro for c in containers if isinstance(c, Db3File))]
+    distro = next((name for name in stated if name and isinstance(name, str)), None)
     return files, containers, one_line(distro, 40) if distro else None, warnings
 
 
 def _metadata(path: Path, warnings: list[str]) -> dict[str, Any]:
     """Return rosbag2_bagfile_information, or nothing where it cannot be read: the data files stand by themselves."""
-    try:
-        if path.stat().st_size > _MAX_METADATA:
-            raise ValueError(f"larger than {_MAX_METADATA} bytes")
-        found = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace"))["rosbag2_bagfile_information"]
-        if not isinstance(found, dict):
-            raise ValueError("no mapping")
-        return found
-    except FileNotFoundError:
+    if not path.exists():
         warnings.append(f"{path.parent.name}: no {METADATA}; the data files in the folder are read")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
-        warnings.append(f"{path.parent.name}/{METADATA} is not readable ({one_line(error, 120)}); the data files in the folder are read")
-    return {}
+        return {}
+    try:
+        data = load_yaml(path, _MAX_METADATA).data
+    except BadInputError as error:
+        warnings.append(f"{path.parent.name}/{METADATA} is not readable ({one_line(error, 200)}); the data files in the folder are read")
+        return {}
+    found = data.get("rosbag2_bagfile_information") if isinstance(data, dict) else None
+    if not isinstance(found, dict):
+        warnings.append(f"{path.parent.name}/{METADATA} holds no rosbag2_bagfile_information; the data files in the folder are read")
+        return {}
+    return found

@@ -8,6 +8,7 @@ import re
 import stat
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -62,8 +63,6 @@ class Document:
 
 def load_yaml(path: Path, max_bytes: int = MAX_BYTES, opencv: bool = False) -> Document:
     """Read a file of one YAML document; `opencv` also tolerates the first line %YAML:1.0 and the tag !!opencv-matrix."""
-    from hashlib import sha256
-
     content = _read(path, max_bytes)
     try:
         text = content.decode("utf-8-sig")

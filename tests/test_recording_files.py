@@ -51,6 +51,9 @@ def test_images_come_in_natural_order_without_times(tmp_path: Path) -> None:
         ("1403709385487836928x", None),
         ("", None),
         ("٣" * 19, None),
+        ("20230131120000", None),  # dates
+        ("20230131120000123", None),
+        ("9" * 20, None),
     ],
 )
 def test_stamps_in_names(text: str, t_ns: int | None) -> None:
@@ -101,6 +104,14 @@ def test_an_asl_folder_holds_all_its_sensors(tmp_path: Path, given: str) -> None
     np.testing.assert_array_equal(pose.q, [[0.5, -0.5, 0.5, 0.5]])  # the file has w first
     assert any("cam1: 1 images of data.csv are missing" in w for w in recording.warnings)
     assert any("cam1: 1 rows of data.csv are not" in w for w in recording.warnings)
+
+
+def test_a_stamp_beyond_any_time_is_no_row(tmp_path: Path) -> None:
+    _image(tmp_path / "cam0" / "data" / "a.png", 7)
+    (tmp_path / "cam0" / "data.csv").write_text(f"{T0},a.png\n9999999999999999999,a.png\n")
+    recording = open_recording([tmp_path / "cam0"])
+    assert [frame.t_ns for frame in recording.images("cam0")] == [T0]
+    assert any("1 rows of data.csv are not" in w for w in recording.warnings)
 
 
 def test_one_camera_of_an_asl_folder(tmp_path: Path) -> None:
@@ -164,6 +175,9 @@ def test_rows_that_are_cut_or_mean_nothing_are_left_out_and_told(tmp_path: Path)
         ("1,2,3\n", "not recognised"),
         ("t,wx,wy,wz,ax,ay,az\n1,1,2,x,4,5,6\n", "columns wx, wy, wz must hold numbers"),
         ("t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\ninf,1,2,3,4,5,6\n", "its time column must hold numbers"),
+        ("t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\n1e900000,1,2,3,4,5,6\n", "its time column must hold numbers .* too large"),
+        ("t,wx,wy,wz,ax,ay,az\n1e999999999,1,2,3,4,5,6\n", "its time column must hold numbers .* too large"),
+        ("t [s],wx,wy,wz,ax,ay,az\n1403709385487836928,1,2,3,4,5,6\n", "its time column must hold numbers"),
         ("\0\0\0", "holds no rows of numbers"),
     ],
 )

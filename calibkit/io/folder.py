@@ -19,6 +19,7 @@ _MAX_FILE = 2**30  # bytes of one image
 _NUMBER = re.compile(r"[0-9]{1,20}(\.[0-9]{1,9})?")
 # A number is a time since 1970 in the unit that its size allows; smaller ones are counters (up to 1e8 s: March 1973).
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
+_END_OF_TIME = 2**62  # ns, in 2116: what lies beyond is no time, but a date such as 20230131120000, say
 
 
 def is_image(path: Path) -> bool:
@@ -31,7 +32,8 @@ def stamp_ns(text: str) -> int | None:
     if not _NUMBER.fullmatch(text):
         return None
     value = Decimal(text)
-    return next((int(value * unit) for least, unit in _UNITS if value >= least), None)
+    t_ns = next((int(value * unit) for least, unit in _UNITS if value >= least), None)
+    return t_ns if t_ns is not None and t_ns < _END_OF_TIME else None
 
 
 def image_folder(folder: Path, name: str) -> Source:
@@ -60,7 +62,8 @@ def asl_camera(folder: Path, name: str) -> Source:
                 continue
             stamp, _, file = (part.strip() for part in line.partition(","))
             path = folder / "data" / Path(file).name  # only the name: the table may not point elsewhere
-            if not stamp.isascii() or not stamp.isdigit() or len(stamp) > 19 or path.suffix.lower() not in images.SUFFIXES:
+            is_stamp = stamp.isascii() and stamp.isdigit() and len(stamp) <= 19 and int(stamp) < _END_OF_TIME
+            if not is_stamp or path.suffix.lower() not in images.SUFFIXES:
                 bad += 1
             elif not path.is_file():
                 missing += 1

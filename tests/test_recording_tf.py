@@ -80,3 +80,12 @@ def test_frames_that_are_not_connected_are_refused_with_those_that_are(tmp_path:
         recording.tf("world", "lidar")
     with pytest.raises(BadInputError, match="name two frames"):
         recording.tf("world", "world")
+
+
+def test_a_static_transform_without_a_proper_rotation_is_refused(tmp_path: Path) -> None:
+    make = Make("mcap")
+    entry = T0, "hand", "cam", np.zeros(3), np.array([0.0, 0, 0, 5])
+    moving = _entry(T0, "odom", "hand", np.eye(4))
+    recording = open_recording([write(tmp_path, "mcap", [("/tf_static", T0, make.tf(entry)), ("/tf", T0, make.tf(moving))])])
+    with pytest.raises(BadInputError, match="tf from odom to cam holds no transform"):
+        recording.tf("odom", "cam")

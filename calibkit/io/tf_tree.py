@@ -73,7 +73,7 @@ def chain(edges: Edges, parent: str, child: str, name: str) -> PoseSamples:
     steps = [(edges[a, b], False) if (a, b) in edges else (edges[b, a], True) for a, b in path]
     moving = [edge for edge, _ in steps if not edge.static]
     slowest = min(moving or [edge for edge, _ in steps], key=lambda edge: len(edge.poses.t_ns), default=None)
-    if slowest is None or not len(slowest.poses.t_ns):
+    if slowest is None or not all(len(edge.poses.t_ns) for edge, _ in steps):
         raise BadInputError(f"{name}: tf from {one_line(parent, 60)} to {one_line(child, 60)} holds no transform: name two frames")
     times = np.unique(slowest.poses.t_ns)
     T, keep = np.broadcast_to(np.eye(4), (len(times), 4, 4)), np.ones(len(times), bool)

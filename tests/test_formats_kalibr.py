@@ -240,6 +240,7 @@ def changed(camera: str, **values: Any) -> dict[str, Any]:
         ({"imu0": {**IMU, "update_rate": 0}}, "imu0.update_rate: a rate is positive"),
         ({**IMU, "gyroscope_noise_density": -1.0}, "gyroscope_noise_density: a noise density is not negative"),
         ({"a": 1}, "is in no known format"),
+        ({"cam٣": CHAIN["cam0"]}, "is in no known format"),
     ],
 )
 def test_what_is_wrong_is_refused_with_line_and_key(tmp_path: Path, chain: dict[str, Any], message: str) -> None:

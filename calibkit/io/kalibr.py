@@ -43,11 +43,12 @@ _LENS_KEYS = ("camera_model", "intrinsics", "distortion_model", "distortion_coef
 _CAMERA_KEYS = (*_LENS_KEYS, "rostopic", "cam_overlaps", "T_cn_cnm1", "T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
 _IMU_KEYS = (*NOISE, "rostopic", "update_rate", "T_i_b", "time_offset")
 _IMU_MODEL_KEYS = ("model", "gyroscopes", "accelerometers", "Tw", "Ta", "Tg", "R_IMUtoGYRO", "R_IMUtoACC")
+_SENSOR = re.compile(r"(cam|imu)[0-9]{1,3}")  # not \d: other scripts' digits make no name of a rig file
 _DISAGREE_RAD, _DISAGREE_M = 2e-3, 2e-3  # beyond rounding, between T_cn_cnm1 and the two T_cam_imu
 
 
 def _recognises(data: Mapping[str, Any]) -> bool:
-    return any(re.fullmatch(r"(cam|imu)\d{1,3}", key) for key in data) or any(key in data for key in NOISE)
+    return any(_SENSOR.fullmatch(key) for key in data) or any(key in data for key in NOISE)
 
 
 def _read(document: Document, so_far: Rig) -> Imported:
@@ -56,7 +57,7 @@ def _read(document: Document, so_far: Rig) -> Imported:
     imus: dict[str, Imu] = {}
     transforms: dict[str, Transform] = {}
     offsets: dict[str, TimeOffset] = {}
-    sensors: dict[str, tuple[str, ...]] = {key: (key,) for key in data if re.fullmatch(r"(cam|imu)\d{1,3}", key)}
+    sensors: dict[str, tuple[str, ...]] = {key: (key,) for key in data if _SENSOR.fullmatch(key)}
     if not sensors:  # imu.yaml as one writes it for Kalibr: the keys of one IMU, without its name
         sensors = {f"imu{len(so_far.imus)}": ()}
     else:

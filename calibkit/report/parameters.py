@@ -7,6 +7,7 @@ from math import degrees, floor, log10
 import numpy as np
 
 from calibkit.data.rig import Camera, Estimate, Imu, Rig, TimeOffset, Transform
+from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
 
@@ -82,15 +83,16 @@ def _row(part: str, name: str, estimate: Estimate, note: str = "") -> Row:
 
 
 def _transform_rows(name: str, transform: Transform) -> Iterator[Row]:
-    """Yield translation and rotation vector; the covariance in b's frame turned into a: p_a moves by R rho."""
+    """Yield translation and rotation vector v = log R, the covariance of (rho, phi) carried over: dp_a = R rho, dv = J_r(v)^-1 phi."""
     T = np.array(transform.matrix)
     known = transform.status is not Status.NOT_OBSERVABLE
-    sigma: list[float | None] = [None] * 6
-    if transform.covariance is not None and transform.covariance.order == ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]:
-        cov = np.array(transform.covariance.matrix)
-        in_a = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T
-        sigma = [float(v) for v in np.sqrt(np.maximum([*np.diag(in_a), *np.diag(cov)[3:]], 0))]
     vector = so3.log(T[:3, :3])
+    sigma: list[float | None] = [None] * 6
+    if transform.covariance is not None and transform.covariance.order == list(TANGENT):
+        carry = np.zeros((6, 6))
+        carry[:3, :3], carry[3:, 3:] = T[:3, :3], np.linalg.inv(so3.right_jacobian(vector))
+        variance = np.diag(carry @ np.array(transform.covariance.matrix) @ carry.T)
+        sigma = [float(v) for v in np.sqrt(np.maximum(variance, 0))]
     for i, axis in enumerate("xyz"):
         yield Row(name, f"p_{axis}", float(T[i, 3]) if known else None, sigma[i] if known else None, None, "m", transform.status)
     for i, axis in enumerate("xyz"):

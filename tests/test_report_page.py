@@ -16,6 +16,7 @@ from calibkit.data.rig import Estimate, Imu, Rig
 from calibkit.data.transforms import make_time_offset, make_transform
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.detection.thumbnails import draw_corners
+from calibkit.geometry import se3, so3
 from calibkit.opencv import cv2
 from calibkit.report.page import build
 from calibkit.report.parameters import number, rows
@@ -120,6 +121,7 @@ def _nothing_kept(residuals):
         lambda r: replace(r, context={**r.context, "tilt": np.full(len(r.raw), np.nan)}),
         lambda r: replace(r, context={**r.context, "frame": np.zeros(len(r.raw), np.int32)}),
         lambda r: replace(r, context={**r.context, "frame": np.full(len(r.raw), 2**31 - 1, np.int32)}),
+        lambda r: replace(r, raw=np.full_like(r.raw, 1e200)),
         lambda r: replace(r, t_ns=r.t_ns[:1], raw=r.raw[:1], sigma=r.sigma[:1], context={k: v[:1] for k, v in r.context.items()}),
         lambda r: replace(r, t_ns=r.t_ns[:0], raw=r.raw[:0], sigma=r.sigma[:0], context={k: v[:0] for k, v in r.context.items()}),
     ],
@@ -133,6 +135,7 @@ def _nothing_kept(residuals):
         "no tilt",
         "one frame",
         "odd index",
+        "absurd",
         "one",
         "none",
     ],
@@ -160,12 +163,23 @@ def test_every_part_of_a_rig_is_in_the_table():
     p_x = table["T_cam1_cam0", "p_x"]
     assert (p_x.value_text, p_x.sigma_text) == ("0.1000", "0.0020")  # sigma of rho_y, which R_z turns into x
     assert table["T_cam1_cam0", "rotation vector z"].note == "90.0000 deg"
+    assert table["T_cam1_cam0", "rotation vector z"].sigma == pytest.approx(2e-4)
     assert table["T_cam0_imu0", "p_x"].value is None
     assert (table["dt_imu0_cam0", "offset"].value_text, table["dt_imu0_cam0", "offset"].sigma_text) == ("-0.008000", "1.0e-05")
     summary = summarise(rig, [Result(stage="joint", rig=rig, reasons=())])
     assert summary.verdict is Verdict.FAIL
     assert "T_cam0_imu0: not observable in this recording: p_x" in summary.reasons[0].text
     assert b'T_cam0_imu0 <b>p_x</b></td><td class="n">\xe2\x80\x93' in build(summary)["report.html"]
+
+
+def test_the_sigma_of_a_rotation_vector_is_that_of_its_own_components():
+    """Against 4000 draws of R exp(phi) about a turn of 2 rad, where phi's axes and the vector's are far apart."""
+    T = se3.make(so3.exp(np.array([1.2, -0.8, 1.4])), np.zeros(3))
+    cov = np.diag([0, 0, 0, 1e-8, 9e-8, 4e-8])
+    steps = np.random.default_rng(0).multivariate_normal(np.zeros(6), cov, 4000)
+    drawn = so3.log(se3.retract(T, steps)[:, :3, :3]).std(axis=0)
+    told = [row.sigma for row in rows(Rig(transforms={"T_a_b": make_transform("a", "b", T, cov, Status.DETERMINED)}))][3:]
+    np.testing.assert_allclose(told, drawn, rtol=0.05)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from calibkit.data.result import ResidualSet, Result, Thumbnail
 from calibkit.data.rig import Rig, StageRun
@@ -25,6 +25,7 @@ from calibkit.io.atomic import write_atomic
 
 MAX_FILE_BYTES = 256 << 20
 MAX_TOTAL_BYTES = 1 << 30  # unpacked: a thousand frames of 144 corners are 11 MB
+MAX_HEADER_BYTES = 16 << 20  # as objects, JSON takes many times its size
 MAX_ENTRIES = 1000
 HEADER = "header.json"
 Dtype = Literal["bool", "int32", "int64", "float64"]
@@ -52,6 +53,11 @@ class _Entry(BaseModel):
     context: Annotated[list[ArrayName], Field(max_length=40)]
 
 
+def _finite(facts: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    json.dumps(facts, allow_nan=False)  # they go into report.json, which holds no NaN: a ValueError
+    return facts
+
+
 class _Header(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
@@ -62,7 +68,7 @@ class _Header(BaseModel):
     thumbnails: Annotated[list[str], Field(max_length=40)]
     reasons: list[tuple[Verdict, str]]
     not_observable: list[str]
-    facts: dict[str, JsonValue]
+    facts: Annotated[dict[str, JsonValue], AfterValidator(_finite)]
 
 
 def save_residuals(result: Result, rig_path: Path) -> tuple[str, str]:
@@ -160,6 +166,9 @@ def _unpack(data: bytes, rig: Rig) -> Result:
             raise ValueError("too many entries, or the same name twice")
         if sum(info.file_size for info in infos) > MAX_TOTAL_BYTES:
             raise ValueError(f"unpacks to more than {MAX_TOTAL_BYTES >> 20} MB")
+
+        if by_name[HEADER].file_size > MAX_HEADER_BYTES:
+            raise ValueError(f"{HEADER} is larger than {MAX_HEADER_BYTES >> 20} MB")
 
         def read(name: str) -> bytes:
             info = by_name[name]

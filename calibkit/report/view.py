@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 T = TypeVar("T")
 
+_ABSURD = 1e9  # in any unit: larger residuals mean nothing, and their squares would overflow
+
 
 @dataclass(frozen=True)
 class View:
@@ -73,7 +75,7 @@ def views(result: Result) -> list[View]:
 def _view(result: Result, residuals: ResidualSet) -> View:
     camera = result.rig.cameras.get(residuals.sensor)
     context = residuals.context
-    good = np.all(np.isfinite(residuals.raw), axis=1)
+    good = np.all(np.abs(residuals.raw) < _ABSURD, axis=1)  # NaN is not
     if "uv" in context:
         good &= np.all(np.isfinite(context["uv"].astype(float)), axis=1)
 

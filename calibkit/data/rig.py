@@ -31,6 +31,7 @@ _SIGMA_TOLERANCE = 1e-6  # relative
 
 Finite = Annotated[float, Field(ge=-1e100, le=1e100, allow_inf_nan=False, strict=True)]  # strict: neither true nor "1.0" is a number
 Sigma = Annotated[float, Field(ge=0, le=1e100, allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, le=1e100, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=0, strict=True)]
 Pixels = Annotated[int, Field(gt=0, le=100000, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9]*$", max_length=40)]
@@ -151,7 +152,7 @@ class Imu(Record):
     """One IMU; noise densities are continuous-time: white sigma = density sqrt(rate), a walk's step = density / sqrt(rate)."""
 
     topic: Text | None = None
-    rate_hz: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    rate_hz: Positive | None = None
     gyro_noise_density: Estimate | None = None  # rad/s/sqrt(Hz)
     gyro_random_walk: Estimate | None = None  # rad/s^2/sqrt(Hz)
     accel_noise_density: Estimate | None = None  # m/s^2/sqrt(Hz)

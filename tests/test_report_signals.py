@@ -8,7 +8,7 @@ from report_samples import CX, CY, SIZE, residual_set, result
 
 from calibkit.data.verdict import Verdict
 from calibkit.report.field import _median_by, cells, over_image, over_radius
-from calibkit.report.signals import PROBES, measure, reasons
+from calibkit.report.signals import PROBES, measure, not_good
 from calibkit.report.view import views
 
 CENTRE = np.array([CX, CY])
@@ -29,9 +29,9 @@ def test_every_signal_of_the_table_is_measured_on_a_camera():
 def test_noise_alone_is_good():
     """White noise of 0.2 px over 40 seeds: every signal passes, and what repeats is cleared of noise to 0.02 px."""
     for seed in range(40):
-        made = result(residuals=residual_set(seed=seed), thumbnails=0)
-        assert reasons(made) == ()
-        assert over_image(views(made)[0])[0].size < 0.02
+        view = view_of(seed=seed)
+        assert not_good(measure(view)) == ()
+        assert over_image(view)[0].size < 0.02
 
 
 def test_significance_of_noise_is_about_one_sigma():

@@ -7,22 +7,10 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from calibkit.data.rig import VERSION, Imu, Rig, StageRun
-from calibkit.data.transforms import frames_of, make_covariance, make_time_offset, make_transform
+from calibkit.data.transforms import frames_of
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.atomic import write_atomic
 from calibkit.io.yaml_file import Document, dump_yaml, load_yaml
-
-__all__ = [
-    "dump_rig",
-    "load_rig",
-    "make_covariance",
-    "make_time_offset",
-    "make_transform",
-    "merge_rigs",
-    "residual_path",
-    "save_rig",
-    "updated",
-]
 
 _COMMENTS = {
     "format": "A rig as calibkit knows it: read docs/rig_file.md for the fields. Angles in radians, lengths in metres, times in seconds.",
@@ -87,11 +75,6 @@ def _without_blanks(value: Any) -> Any:
 def save_rig(rig: Rig, path: Path, force: bool = False) -> None:
     """Write the rig file atomically; an existing file is refused unless `force`."""
     write_atomic(path, dump_rig(rig), overwrite=force)
-
-
-def residual_path(rig_path: Path, run: StageRun) -> Path | None:
-    """Return where a stage's residual file lies: beside the rig file, nowhere else."""
-    return None if run.residual_file is None else rig_path.parent / run.residual_file
 
 
 def merge_rigs(rigs: Sequence[tuple[Path, Rig]]) -> Rig:

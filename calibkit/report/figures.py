@@ -1,4 +1,4 @@
-"""The pictures of a report as a table: what each needs, how it is drawn, and what to look for (the only matplotlib user).
+"""The pictures of a report as a table: what each needs, how it is drawn, and what to look for.
 
 A new picture is one function (Figure, View) and one line in PICTURES. Dark on white, told apart by shape as well as by colour.
 """

@@ -9,10 +9,9 @@ from math import inf, isfinite
 
 import numpy as np
 
-from calibkit.data.result import Result
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
-from calibkit.report.view import Array, View, given, rms, views
+from calibkit.report.view import Array, View, given, rms
 
 GOOD_RMS_PX = 0.3
 SIGNIFICANT = 4.0  # sigma below which structure is taken for chance
@@ -88,11 +87,6 @@ def measure(view: View) -> list[Signal]:
             verdict = Verdict.PASS if measured.exempt else probe.judge(measured.value)
             found.append(Signal(probe, view.stage, view.sensor, measured.value, measured.note, verdict))
     return found
-
-
-def reasons(result: Result) -> tuple[Reason, ...]:
-    """Return one sentence for each signal of the result that is not good: for a stage's own verdict."""
-    return not_good(signal for view in views(result) for signal in measure(view))
 
 
 def not_good(signals: Iterable[Signal]) -> tuple[Reason, ...]:

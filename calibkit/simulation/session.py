@@ -71,7 +71,7 @@ def _times(start_ns: int, duration_s: float, rate_hz: float) -> Times:
 
 
 def simulate_session(scenario: Scenario, seed: int = 0) -> Session:
-    """Return the scenario's run with this seed, without its faults (`faults.apply`)."""
+    """Return the scenario's run with this seed, without its faults (`faults.apply_faults`)."""
     rngs = [np.random.default_rng((seed, part, 0)) for part in (_MOTION, _IMU)]
     T_imu_cam = scenario.cameras[0].T_imu_cam
     trajectory = make_trajectory(MOTIONS[scenario.motion], scenario.distance, T_imu_cam, rngs[0])

@@ -1,5 +1,6 @@
 """`calibkit intrinsics`: from a recording of a board to calibrated cameras."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -69,7 +70,7 @@ def run(
         cache=not no_cache,
         ros_distro=ros_distro,
     )
-    outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=" ".join(["calibkit", *sys.argv[1:]]))
+    outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
     show(intrinsics(sources, target, outputs, options, bar), strict)
 
 

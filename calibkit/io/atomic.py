@@ -1,5 +1,6 @@
 """Files written whole or not at all."""
 
+import json
 import os
 import secrets
 import shutil
@@ -28,6 +29,11 @@ def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> N
         raise BadInputError(f"{one_line(path)}: its folder does not exist; create {one_line(target.parent)} first") from None
     except (OSError, ValueError) as error:
         raise BadInputError(f"{one_line(path)}: cannot be written ({reason_of(error)}); choose another place") from None
+
+
+def write_json(path: Path, data: object, overwrite: bool = False) -> None:
+    """Write what `--json` asks for: indented, and never NaN or Infinity, which are no JSON (ValueError)."""
+    write_atomic(path, json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n", overwrite)
 
 
 def reason_of(error: OSError | ValueError) -> str:

@@ -59,6 +59,10 @@ def _check(part: CornerRows, board: Board, image_size: tuple[int, int]) -> None:
                 f"{off[worst]:.3g} m from where {title} has it: check tagSize and tagSpacing of --target"
             )
     if np.any(part.uv < -1) or np.any(part.uv > np.array(image_size)):
-        raise BadInputError(f"{part.file}: corners lie outside of an image of {image_size[0]} x {image_size[1]}: check the image size")
+        (left, top), (right, bottom) = part.uv.min(axis=0), part.uv.max(axis=0)
+        raise BadInputError(
+            f"{part.file}: corners lie outside of an image of {image_size[0]} x {image_size[1]}, "
+            f"from ({left:.0f}, {top:.0f}) to ({right:.0f}, {bottom:.0f}) px: check --resolution"
+        )
     if part.sigma_px is not None and not np.all((part.sigma_px > 0) & np.isfinite(part.sigma_px)):
         raise BadInputError(f"{part.file}: sigma_px must be positive")

@@ -1,6 +1,5 @@
 """What a recording holds, what is wrong with it, and what each topic could be used for."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation import doctor
 from calibkit.estimation.doctor import Finding
-from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.atomic import refuse_existing, write_json
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.source import Stamps, TopicInfo
 
@@ -79,7 +78,7 @@ def info(
     findings = (*doctor.check_clocks(_latencies(recording, survey)), *doctor.check_overlap(spans))
     result = Info(names, tuple(topics), findings, tuple(recording.warnings))
     if json_path is not None:
-        write_atomic(json_path, json.dumps(as_json(result), indent=1, allow_nan=False) + "\n", overwrite=force)
+        write_json(json_path, as_json(result), force)
     return result
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +112,6 @@ def _observe_one(
         if options.resolution is None:
             raise BadInputError(f"{one_line(topic)}: a corner file does not say the image size; add --resolution WIDTHxHEIGHT")
         views = replace(recording.board_views(board, options.resolution, topic), camera=name)
-        _refuse_outside(views, topic)
     else:
         views = find_boards(recording.images(topic), board, name, cache, progress, info.count)
     if not views.n_frames:
@@ -122,16 +122,6 @@ def _observe_one(
             "check the target file against the board, and --camera"
         )
     return views
-
-
-def _refuse_outside(views: BoardViews, topic: str) -> None:
-    low, high = views.uv.min(axis=0), views.uv.max(axis=0)
-    width, height = views.image_size
-    if low.min() < -1 or high[0] > width or high[1] > height:
-        raise BadInputError(
-            f"{one_line(topic)}: corners reach from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) px, "
-            f"outside an image of {width}x{height}: check --resolution"
-        )
 
 
 def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], progress: Progress) -> list[Thumbnail]:
@@ -168,6 +158,4 @@ def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], 
 
 
 def _hashed(path: Path) -> list[tuple[str, str | None]]:
-    from hashlib import sha256
-
     return [(path.name, sha256(path.read_bytes()).hexdigest())]

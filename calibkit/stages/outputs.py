@@ -1,6 +1,5 @@
 """What every stage does with its result: outputs checked before the work, then residuals, rig file, report and JSON, in that order."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,13 +8,13 @@ from calibkit.data.result import Result
 from calibkit.data.rig import InputFile, Rig, StageRun
 from calibkit.data.verdict import worst
 from calibkit.errors import one_line
-from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.atomic import refuse_existing, write_json
 from calibkit.io.residual_file import save_residuals
 from calibkit.io.rig_file import load_rig, merge_rigs, save_rig, updated
 from calibkit.report.signals import measure, not_good
 from calibkit.report.summary import Summary, as_json, summarise
 from calibkit.report.view import views
-from calibkit.stages.report import check_out_dir, write_report
+from calibkit.stages.report import FILES, check_out_dir, write_report
 from calibkit.version import __version__
 
 
@@ -93,10 +92,9 @@ def save(
         save_rig(updated(base, result.rig), outputs.out, force=True)  # `open` has refused what may not be replaced
         files.append(outputs.out)
     if outputs.json is not None:
-        text = json.dumps(as_json(summary), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomic(outputs.json, text + "\n", overwrite=outputs.force)
+        write_json(outputs.json, as_json(summary), outputs.force)
         files.append(outputs.json)
     if outputs.report is not None:
         write_report(result, outputs.report, outputs.force)
-        files.append(outputs.report / "report.html")
+        files.append(outputs.report / FILES[0])
     return Saved(result, summary, tuple(files))

@@ -1,13 +1,12 @@
 """The report of any result: from the stage that just made it, or later from the rig file and its residual files, without the recording."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig, StageRun
 from calibkit.errors import BadInputError, one_line
-from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.atomic import refuse_existing, write_atomic, write_json
 from calibkit.io.residual_file import load_result
 from calibkit.io.rig_file import load_rig
 from calibkit.report.summary import Summary, as_json, summarise
@@ -30,7 +29,7 @@ def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None =
     if out_dir is not None:
         _write_pages(summary, out_dir)
     if json_path is not None:
-        write_atomic(json_path, json.dumps(as_json(summary), indent=1, ensure_ascii=False, allow_nan=False) + "\n", overwrite=force)
+        write_json(json_path, as_json(summary), force)
     return summary
 
 

@@ -12,7 +12,7 @@ from calibkit.errors import CalibkitError, one_line
 from calibkit.version import __version__
 
 # One module `calibkit.cli.NAME` a command, with `register(app)`; --help lists them in this order.
-COMMANDS: tuple[str, ...] = ("info", "intrinsics", "import_", "export", "report", "simulate", "target")
+COMMANDS: tuple[str, ...] = ("target", "info", "intrinsics", "report", "import_", "export", "simulate")
 
 _ANYWHERE = ("--version", "--debug")
 _INTERRUPTED = 130

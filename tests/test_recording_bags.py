@@ -1,10 +1,11 @@
 """Bags of every format: what rosbags wrote comes back; order, times, damage and hostile sizes."""
 
 import bz2
+import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -320,3 +321,15 @@ def test_sources_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
     ):
         with pytest.raises(BadInputError, match=told):
             open_recording([source])
+
+
+def test_a_db3_that_computes_its_messages_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "computed.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute("CREATE TABLE messages (topic_id INTEGER, timestamp INTEGER, data GENERATED ALWAYS AS (zeroblob(900000000)))")
+        database.execute("INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu', 'cdr')")
+        database.execute("INSERT INTO messages (topic_id, timestamp) VALUES (1, 5)")
+        database.commit()
+    with pytest.raises(BadInputError, match="computes columns of its table messages"):
+        open_recording([path])

@@ -76,6 +76,9 @@ class Db3File:
         tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             raise BadInputError(f"{self.path.name} is an SQLite file but no bag: it has no tables topics and messages")
+        for table in ("topics", "messages"):
+            if any(hidden for *_, hidden in database.execute(f"PRAGMA table_xinfo({table})")):  # one row could compute gigabytes
+                raise BadInputError(f"{self.path.name} computes columns of its table {table}, which no bag does: it is not read")
         for number, topic, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
             self._channels[number] = Channel(one_line(topic), ros_type(str(kind)), one_line(encoding, 20))
         if "schema" in tables:

@@ -70,13 +70,18 @@ def seed_rig(instants: Instants, poses: Sequence[Array], errors: Sequence[Array]
         T_b_a = _medoid(poses[b][at_b] @ se3.inverse(poses[a][at_a]))
         T_cam_cam0[b] = T_b_a @ T_cam_cam0[a]
     placed = np.stack([T_cam_cam0[c] for c in range(len(instants))])
-    m = max(int(i.max()) for i in instants) + 1
+    return placed, board_poses(instants, placed, poses, errors)
+
+
+def board_poses(instants: Sequence[NDArray[np.int64]], T_cam_cam0: Array, poses: Sequence[Array], errors: Sequence[Array]) -> Array:
+    """Return T_cam0_board (m, 4, 4) of every instant from the camera that has the best pose T_cam_board for it."""
+    m = max(int(i.max(initial=-1)) for i in instants) + 1
     T_cam0_board, best = np.tile(np.eye(4), (m, 1, 1)), np.full(m, np.inf)
     for c, rows in enumerate(instants):
         better = errors[c] < best[rows]
-        T_cam0_board[rows[better]] = se3.inverse(placed[c]) @ poses[c][better]
+        T_cam0_board[rows[better]] = se3.inverse(T_cam_cam0[c]) @ poses[c][better]
         best[rows[better]] = errors[c][better]
-    return placed, T_cam0_board
+    return T_cam0_board
 
 
 def _medoid(T: Array) -> Array:

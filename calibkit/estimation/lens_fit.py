@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from calibkit.data.observations import BoardViews
 from calibkit.errors import NotConvergedError
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState, Residuals
-from calibkit.estimation.camera_rig_seed import Instants, seed_rig
-from calibkit.estimation.lens_seed import seed_camera
+from calibkit.estimation.camera_rig_seed import Instants, board_poses, seed_rig
+from calibkit.estimation.lens_seed import robust_poses_of_views, seed_camera
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
 from calibkit.solver.levenberg_marquardt import minimise
@@ -21,6 +21,7 @@ _OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
 _NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
 _BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
+_POSE_LOSS = 8.0  # px: wide enough to bring a pose in from a far start
 _FINEST = 1e-6  # sigmas; perfect data leaves rounding alone, in which nothing stands out
 
 Mask = NDArray[np.bool_]
@@ -99,7 +100,28 @@ def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: I
     _renumber(grids)
     T_cam_cam0, T_cam0_board = seed_rig(tuple(g.instant for g in grids), poses, errors)
     problem = CameraProblem(points, tuple(grids))
-    return _solve(used, problem, LensState(tuple(lenses), T_cam_cam0, T_cam0_board), dropped, robust)
+    fit, rows = _solve(used, problem, LensState(tuple(lenses), T_cam_cam0, T_cam0_board), dropped, robust)
+    if len(fit.dropped) > len(dropped):
+        fit, _ = _solve(used, problem, _all_views(problem, fit, rows), dropped, robust)
+    return fit
+
+
+def _all_views(problem: CameraProblem, fit: LensFit, rows: list[NDArray[np.int64]]) -> LensState:
+    """Return the state of a fit with the views that it gave up posed anew under its lenses: the seed's may have misled them."""
+    m = max(int(grid.instant.max()) for grid in problem.cameras) + 1
+    T_cam0_board, known = np.tile(np.eye(4), (m, 1, 1)), np.zeros(m, bool)
+    for grid, part, kept in zip(problem.cameras, fit.problem.cameras, rows, strict=True):
+        T_cam0_board[grid.instant[kept]] = fit.state.T_cam0_board[part.instant]
+        known[grid.instant[kept]] = True
+    grids = [_rows(grid, ~known[grid.instant]) for grid in problem.cameras]
+    lost = _renumber(grids)
+    poses = [robust_poses_of_views(grid, lens, problem.points) for grid, lens in zip(grids, fit.state.lenses, strict=True)]
+    start = board_poses([g.instant for g in grids], fit.state.T_cam_cam0, [p.T_cam_board for p in poses], [p.error for p in poses])
+    per_px = float(np.median(np.concatenate([grid.weight[grid.weight > 0] for grid in problem.cameras])))
+    held = CameraProblem(problem.points, tuple(grids), _POSE_LOSS * per_px, free_lens=False, free_rig=False)
+    if len(lost):
+        T_cam0_board[lost] = minimise(held, LensState(fit.state.lenses, fit.state.T_cam_cam0, start), tolerance=1e-8).x.T_cam0_board
+    return LensState(fit.state.lenses, fit.state.T_cam_cam0, T_cam0_board)
 
 
 def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None) -> LensFit:
@@ -151,7 +173,11 @@ def _renumber(grids: list[CameraViews]) -> NDArray[np.int64]:
     return kept
 
 
-def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dropped: list[DroppedView], robust: bool) -> LensFit:
+def _solve(
+    used: list[BoardViews], problem: CameraProblem, state: LensState, dropped: list[DroppedView], robust: bool
+) -> tuple[LensFit, list[NDArray[np.int64]]]:
+    """Return the fit and which of the views took part."""
+    dropped, rows = list(dropped), [np.arange(views.n_frames) for views in used]
     found = [camera.weight for camera in problem.cameras]
     if robust:
         # From px-wide tolerance inwards: the noise is unknown until most corners fit.
@@ -159,7 +185,12 @@ def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dro
             scale = _noise(problem, state)
             solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x
-            used, problem, state, found = _judge_views(used, problem, state, found, dropped)
+            good, grids = _judge_views(used, problem, state, found, dropped)
+            state = replace(state, T_cam0_board=state.T_cam0_board[_renumber(grids)])
+            problem = replace(problem, cameras=tuple(grids))
+            used = [views.select(keep) for views, keep in zip(used, good, strict=True)]
+            found = [weight[keep] for weight, keep in zip(found, good, strict=True)]
+            rows = [row[keep] for row, keep in zip(rows, good, strict=True)]
         for _ in range(2):  # corners given up at the robust end may come back at the plain one
             problem = _give_up_corners(problem, state, found)
             solution = minimise(problem, state)
@@ -173,7 +204,7 @@ def _solve(used: list[BoardViews], problem: CameraProblem, state: LensState, dro
     if not np.isfinite(solution.cost):
         raise NotConvergedError(f"{names}: the solver found no minimum: check the target file, or try another --model")
     observed = tuple(weight > 0 for weight in found)
-    return LensFit(tuple(used), problem, solution.x, observed, tuple(dropped), solution.converged)
+    return LensFit(tuple(used), problem, solution.x, observed, tuple(dropped), solution.converged), rows
 
 
 def _normalised(problem: CameraProblem, state: LensState, c: int, weight: Array) -> tuple[Array, Mask]:
@@ -191,25 +222,23 @@ def _noise(problem: CameraProblem, state: LensState) -> float:
 
 def _judge_views(
     used: list[BoardViews], problem: CameraProblem, state: LensState, found: list[Array], dropped: list[DroppedView]
-) -> tuple[list[BoardViews], CameraProblem, LensState, list[Array]]:
-    """Weigh noisy views down and give hopeless ones up."""
-    grids, kept_views, kept_found = [], [], []
+) -> tuple[list[Mask], list[CameraViews]]:
+    """Return which views are worth keeping and those, the noisy ones weighed down; the others are added to `dropped`."""
+    kept, grids = [], []
     for c, (views, grid) in enumerate(zip(used, problem.cameras, strict=True)):
         z, seen = _normalised(problem, state, c, found[c])
         scale = np.array([scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(z, seen, strict=True)])
         typical = max(float(np.median(scale)), _FINEST)
         good = scale <= _BAD_VIEW * typical
-        dropped += [
-            DroppedView(views.camera, views.labels[i], f"its corners fit {scale[i] / typical:.0f} times worse than usual")
-            for i in np.flatnonzero(~good)
-        ]
+        dropped += [DroppedView(views.camera, views.labels[i], _misfit(scale[i] / typical)) for i in np.flatnonzero(~good)]
         noisier = np.maximum(scale / (_NOISY_VIEW * typical), 1.0)[good]
         grids.append(replace(_rows(grid, good), weight=found[c][good] / noisier[:, None]))
-        kept_views.append(views.select(good))
-        kept_found.append(found[c][good])
-    kept = _renumber(grids)
-    state = replace(state, T_cam0_board=state.T_cam0_board[kept])
-    return kept_views, replace(problem, cameras=tuple(grids)), state, kept_found
+        kept.append(good)
+    return kept, grids
+
+
+def _misfit(times: float) -> str:
+    return f"its corners fit {times:.0f} times worse than usual" if np.isfinite(times) else "no board pose fits its corners"
 
 
 def _give_up_corners(problem: CameraProblem, state: LensState, found: list[Array]) -> CameraProblem:

@@ -206,3 +206,12 @@ def test_a_thumbnail_shows_kept_and_dropped_corners_apart():
     assert np.min(around(found[0]).sum(axis=1)) < 500
     deep = draw_corners((image.astype(np.uint16) << 8), found, found * np.nan, np.array([True, False]), "16 bit, no prediction")
     assert cv2.imdecode(np.frombuffer(deep, np.uint8), cv2.IMREAD_COLOR).shape == picture.shape
+
+
+def test_a_thumbnail_of_twelve_bits_in_sixteen_is_as_clear_as_one_of_eight():
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    image = (127 + 127 * np.sin(x / 40) * np.sin(y / 40)).astype(np.uint8)
+    nothing = np.zeros((0, 2))
+    jpegs = [draw_corners(i, nothing, nothing, np.zeros(0, bool), "") for i in (image, image.astype(np.uint16) << 4)]
+    eight, twelve = (cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).astype(float) for jpeg in jpegs)
+    assert np.abs(eight - twelve).mean() < 2

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.detection.found import Image, to_8_bit
 from calibkit.opencv import cv2
 
 Array = NDArray[np.float64]
@@ -12,19 +13,15 @@ SHIFT = 4  # cv2 draws at 1/16 px
 STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
-def draw_corners(
-    image: NDArray[np.uint8] | NDArray[np.uint16], found: Array, predicted: Array, kept: NDArray[np.bool_], caption: str
-) -> bytes:
+def draw_corners(image: Image, found: Array, predicted: Array, kept: NDArray[np.bool_], caption: str) -> bytes:
     """Return a JPEG about 640 px wide: kept corners as circles, dropped ones as crosses, a line from each towards its prediction.
 
     `found`, `predicted` (n, 2) px. The lines are magnified, the factor stands in the caption's strip.
     """
-    gray = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    gray = to_8_bit(image)
     scale = WIDTH / gray.shape[1]
     size = (WIDTH, max(1, round(gray.shape[0] * scale)))
-    picture = cv2.resize(gray, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    if picture.ndim == 2:
-        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(cv2.resize(gray, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR), cv2.COLOR_GRAY2BGR)
     picture = cv2.addWeighted(picture, 0.5, np.full_like(picture, 255), 0.5, 0)  # paler, so that the marks stand out
     residual = predicted - found
     factor = _magnification(residual[kept] * scale)

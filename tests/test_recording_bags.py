@@ -333,3 +333,14 @@ def test_a_db3_that_computes_its_messages_is_refused(tmp_path: Path) -> None:
         database.commit()
     with pytest.raises(BadInputError, match="computes columns of its table messages"):
         open_recording([path])
+
+
+def test_a_files_name_cannot_speak_to_the_terminal(tmp_path: Path) -> None:
+    path = write(tmp_path, "mcap", _messages("mcap", 400))
+    data = next(path.glob("*.mcap"))
+    (path / "metadata.yaml").unlink()
+    data.with_name("\x1b[2Jbag\udc9b.mcap").write_bytes(data.read_bytes()[:-100])
+    data.unlink()
+    warnings = open_recording([path]).warnings
+    assert any("is damaged" in w for w in warnings)
+    assert all(w.isprintable() for w in warnings)

@@ -44,7 +44,7 @@ class Recording:
     @property
     def warnings(self) -> list[str]:
         """What was salvaged, left out or replaced so far; complete once the topics have been read."""
-        return list(dict.fromkeys(warning for source in self._sources for warning in source.warnings))
+        return list(dict.fromkeys(one_line(warning, 1000) for source in self._sources for warning in source.warnings))
 
     def choose(self, kind: str, asked: str | None = None) -> str:
         """Return the topic of a kind: the one asked for, or the only one; BadInputError lists the candidates."""

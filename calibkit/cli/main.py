@@ -59,13 +59,16 @@ def main() -> None:
         _fail(error, 2, f"{one_line(error.format_message())} (see {context.command_path if context else 'calibkit'} --help)")
     except CalibkitError as error:
         _fail(error, error.exit_code, one_line(error, 1000))
-    except (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError) as error:
+    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except OSError as error:
         _fail(error, 2, one_line(error))
     except Exception as error:
         cause = error.__cause__ if isinstance(error, typer.Abort) and error.__cause__ else error  # Typer's Abort hides an EOFError
         _fail(cause, 4, f"internal error: {type(cause).__name__}: {one_line(cause)} (please report it with --debug's output)")
     if code == _INTERRUPTED:  # what Typer makes of Ctrl-C
-        typer.echo("calibkit: interrupted, nothing was written", err=True)
+        typer.echo("calibkit: interrupted", err=True)
     sys.exit(code if arguments else 2)
 
 

@@ -96,9 +96,11 @@ def _look(frame: ImageFrame, board: Board, cache: CornerCache | None) -> Outcome
     if entry is None:
         try:
             image = frame.decode()
+            entry = (image.shape[1], image.shape[0]), detect(image, board)
         except BadInputError as error:
             return frame.t_ns, frame.label, error
-        entry = (image.shape[1], image.shape[0]), detect(image, board)
+        except cv2.error as error:  # one odd image must not end the run
+            return frame.t_ns, frame.label, BadInputError(f"OpenCV cannot work on it ({one_line(error, 80)})")
         if cache:
             cache.put(key, *entry)
     return frame.t_ns, frame.label, entry

@@ -11,6 +11,7 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Camera, Estimate, Reprojection, Rig, Transform
 from calibkit.data.transforms import make_covariance, make_transform
 from calibkit.data.verdict import Reason, Status, Verdict, worst
+from calibkit.errors import NotConvergedError
 from calibkit.estimation.camera_rig_seed import components, match_instants
 from calibkit.estimation.lens_fit import LensFit, fit_lenses
 from calibkit.estimation.lens_trust import border_scales, lens_covariance
@@ -57,8 +58,17 @@ def calibrate_cameras(requests: Sequence[CameraRequest], robust: bool = True, ma
         fit = fit_lenses([views[c] for c in group], [models[c] for c in group], tuple(instants[c] for c in group), robust)
         covariance = lens_covariance(fit)
         judged = tuple(judge_lens(fit, i, covariance, scores[c]) for i, c in enumerate(group))
+        _refuse_unconverged(fit, judged)
         solved.append(_Solved(fit, covariance, judged, held_out(fit)))
     return _result(requests, groups, solved, scores)
+
+
+def _refuse_unconverged(fit: LensFit, judged: Sequence[LensJudgement]) -> None:
+    """Raise NotConvergedError where the solver did not end and no verdict tells why (a wrong model, too few looks)."""
+    if fit.converged or any(reason.verdict is Verdict.FAIL for judgement in judged for reason in judgement.reasons):
+        return
+    names = ", ".join(views.camera for views in fit.views)
+    raise NotConvergedError(f"{names}: the solver did not converge: check the target file against the board, or try another --model")
 
 
 def _result(requests: Sequence[CameraRequest], groups: list[list[int]], solved: list[_Solved], scores: list[list[ModelScore]]) -> Result:
@@ -79,6 +89,7 @@ def _result(requests: Sequence[CameraRequest], groups: list[list[int]], solved: 
         for i in range(1, len(group)):
             a, b = requests[group[i]].views.camera, requests[group[0]].views.camera
             transforms[f"T_{a}_{b}"] = entry = _transform(part, i, a, b)
+            unknown += [f"T_{a}_{b}"] if entry.status is Status.NOT_OBSERVABLE else []
             reasons += [Reason(entry.verdict or Verdict.PASS, text) for text in entry.reasons]
     for group in groups[1:]:
         names = ", ".join(requests[c].views.camera for c in group)

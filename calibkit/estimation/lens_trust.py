@@ -13,7 +13,6 @@ from calibkit.models.cameras import CameraModel
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _SAME_ORIENTATION = np.deg2rad(5.0)
-MIN_ORIENTATIONS = 3
 _GRID = (24, 16)
 _BIAS_INSTANTS = 60
 _BIAS_PATCHES = (4, 3)

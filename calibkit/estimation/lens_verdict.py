@@ -42,8 +42,6 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     statuses = tuple(Status(grade(float(ratio))) for ratio in np.sqrt(np.diag(cov)) / scales)
     reasons += _direction_reasons(fit, c, covariance, cov, scales)
     reasons += _extrapolation_reasons(camera, views.image_size, projection)
-    if not fit.converged:
-        reasons.append(Reason(Verdict.CHECK, f"{camera}: the solver stopped before it had converged"))
     return LensJudgement(statuses, tuple(reasons), projection)
 
 

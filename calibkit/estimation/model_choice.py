@@ -1,7 +1,7 @@
 """Which lens model fits a camera: judged by the error on views that the fit did not see."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,6 +63,7 @@ def compare_models(views: BoardViews, models: Sequence[str]) -> list[ModelScore]
     Models that do not converge are left out; raises NotConvergedError when none does.
     """
     few = views.select(np.unique(np.linspace(0, views.n_frames - 1, min(views.n_frames, _VIEWS)).astype(int)))
+    few = replace(few, labels=tuple(str(i) for i in range(few.n_frames)))  # stamps may repeat, these do not
     fits: dict[str, LensFit] = {}
     failure: NotConvergedError | None = None
     for model in models:
@@ -90,13 +91,12 @@ def compare_models(views: BoardViews, models: Sequence[str]) -> list[ModelScore]
 
 
 def _squares_by_view(views: BoardViews, fits: dict[str, LensFit], results: dict[str, HeldOut]) -> dict[str, Array]:
-    """Return each model's mean squared error by view, over corners that at least one model kept."""
-    number = {label: i for i, label in enumerate(views.labels)}
+    """Return each model's mean squared error by view, over corners that at least one model kept; labels are the views' numbers."""
     shape = (views.n_frames, len(views.board.points))
     kept = np.zeros(shape, bool)
     errors = {}
     for model, result in results.items():
-        rows = [number[label] for label in result.labels]
+        rows = [int(label) for label in result.labels]
         kept[rows] |= fits[model].kept[0]
         errors[model] = np.full(shape, _WORST_PX)
         errors[model][rows] = np.fmin(result.error_px, _WORST_PX)

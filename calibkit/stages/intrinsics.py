@@ -1,5 +1,6 @@
 """`calibkit intrinsics`: images or corners of a board to calibrated cameras."""
 
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -138,7 +139,8 @@ def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], 
     ranked = sorted(ranked, reverse=True)[:_WORST_FRAMES]
     drawn: dict[tuple[str, int], Thumbnail] = {}
     for name, topic in topics.items():
-        wanted = {labels[name][i]: i for _, camera, i in ranked if camera == name}
+        once = Counter(labels[name])  # under a stamp that repeats, which image it was cannot be told
+        wanted = {labels[name][i]: i for _, camera, i in ranked if camera == name and once[labels[name][i]] == 1}
         if not wanted or not any(t.name == topic and t.kind == "image" for t in recording.topics):
             continue
         residuals = sets[name]

@@ -128,7 +128,9 @@ def test_a_transform_from_a_second_and_a_half_is_not_known_either():
     hurried = [replace(v, t_ns=10**9 + v.t_ns // 10) for v in views]
     result = calibrate_cameras([CameraRequest(v, model) for v, model in zip(hurried, ("pinhole-radtan", "pinhole-equi"), strict=True)])
     assert result.exit_code == 3
-    assert result.rig.transforms["T_cam1_cam0"].status is not Status.DETERMINED
+    assert result.rig.transforms["T_cam1_cam0"].status is Status.NOT_OBSERVABLE
+    assert "T_cam1_cam0" in result.not_observable
+    assert "T_cam1_cam0 is not observable" in texts(result, Verdict.FAIL)
 
 
 def test_a_board_in_one_corner_only_is_extrapolated_elsewhere():

@@ -85,7 +85,7 @@ def _result(requests: Sequence[CameraRequest], groups: list[list[int]], solved: 
             residuals.append(_residual_set(part.fit, i))
             reasons += part.judgements[i].reasons
             unknown += [f"{name}.{p}" for p, e in cameras[name].parameters.items() if e.status is Status.NOT_OBSERVABLE]
-            _camera_facts(facts, name, part, i, scores[c], requests[c].views)
+            _camera_facts(facts, name, part, i, scores[c], requests[c])
         for i in range(1, len(group)):
             a, b = requests[group[i]].views.camera, requests[group[0]].views.camera
             transforms[f"T_{a}_{b}"] = entry = _transform(part, i, a, b)
@@ -174,13 +174,21 @@ def _residual_set(fit: LensFit, i: int) -> ResidualSet:
     )
 
 
-def _camera_facts(facts: dict[str, object], name: str, part: _Solved, i: int, scores: list[ModelScore], asked: BoardViews) -> None:
+def _camera_facts(facts: dict[str, object], name: str, part: _Solved, i: int, scores: list[ModelScore], request: CameraRequest) -> None:
     """Note what the report and --json show beside the rig."""
     where = part.fit.problem.lens_slices[i]
     projection = part.judgements[i].projection
     entries: dict[str, object] = {
         "frame_labels": list(part.fit.views[i].labels),
-        "models": {s.model: {"held_out_px": _or_none(s.error_px), "kept_rms_px": _or_none(s.rms_px), "fits": s.within} for s in scores},
+        "models": {
+            s.model: {
+                "held_out_px": _or_none(s.error_px),
+                "kept_rms_px": _or_none(s.rms_px),
+                "fits": s.within,
+                "asked": s.model == request.model,
+            }
+            for s in scores
+        },
         "covariance": {
             "variance_factor": part.covariance.variance_factor,
             "blocks": part.covariance.blocks,
@@ -193,7 +201,7 @@ def _camera_facts(facts: dict[str, object], name: str, part: _Solved, i: int, sc
             "sigma_px": [_or_none(s) for s in projection.sigma.tolist()],
             "seen": projection.seen.tolist(),
         },
-        "views": {"images": asked.n_images, "with_board": asked.n_frames, "used": part.fit.views[i].n_frames},
+        "views": {"images": request.views.n_images, "with_board": request.views.n_frames, "used": part.fit.views[i].n_frames},
     }
     for key, value in entries.items():
         by_camera = facts.setdefault(key, {})
@@ -212,10 +220,10 @@ def _transform(part: _Solved, i: int, a: str, b: str) -> Transform:
     where = part.fit.problem.rig_slice(i)
     cov = part.covariance.corrected[where, where]
     weakest = directions(cov, border_scales(part.fit.problem, part.fit.state.lenses)[where])[0]
-    reasons = []
-    if weakest.grade != "determined":
-        reasons.append(
-            f"T_{a}_{b} is {weakest.grade} ({weakest.sigma:.0f} times 1 mm, 1 mrad): show both cameras the board nearer and longer"
-        )
-    verdict = {"determined": Verdict.PASS, "weak": Verdict.CHECK, "not observable": Verdict.FAIL}[weakest.grade]
-    return make_transform(a, b, part.fit.state.T_cam_cam0[i], cov, Status(weakest.grade), verdict=verdict, reasons=reasons)
+    status, reasons = Status(weakest.grade), []
+    if any(set(part.judgements[k].statuses) == {Status.NOT_OBSERVABLE} for k in (0, i)):
+        status, reasons = Status.NOT_OBSERVABLE, [f"T_{a}_{b} is not observable: it stands on a lens that is not"]
+    elif status is not Status.DETERMINED:
+        reasons = [f"T_{a}_{b} is {status.value} ({weakest.sigma:.0f} times 1 mm, 1 mrad): show both cameras the board nearer and longer"]
+    verdict = {Status.DETERMINED: Verdict.PASS, Status.WEAK: Verdict.CHECK, Status.NOT_OBSERVABLE: Verdict.FAIL}[status]
+    return make_transform(a, b, part.fit.state.T_cam_cam0[i], cov, status, verdict=verdict, reasons=reasons)

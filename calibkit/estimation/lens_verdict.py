@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.estimation.lens_fit import LensFit, instant_times
@@ -15,6 +16,7 @@ from calibkit.solver.trust import Covariance, directions, grade
 
 MIN_LOOKS = 3  # orientations, and seconds: two numbers of fx fy cx cy a look, and one look to check them
 _WORSE_MODEL, _WRONG_MODEL = 1.1, 2.0  # held-out error over the best model's
+_NO_MODEL_PX = 1.0
 _EXTRAPOLATED_PX = 1.0
 _DROPPED_FRAMES = 0.1
 
@@ -36,10 +38,15 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     scales = border_scales(fit.problem, fit.state.lenses)[where]
     projection = projection_sigma(views, lens, cov)
     reasons = [*_model_reasons(camera, views.model.name, scores), *_frame_reasons(fit, c)]
+    hopeless = _no_model_fits(camera, scores)
     too_few = _too_few_looks(fit, c)
     if too_few:
         return LensJudgement((Status.NOT_OBSERVABLE,) * len(lens), (Reason(Verdict.FAIL, f"{camera}: {too_few}"), *reasons), projection)
-    statuses = tuple(Status(grade(float(ratio))) for ratio in np.sqrt(np.diag(cov)) / scales)
+    weakest = directions(cov, scales)[0]
+    known = np.maximum(np.sqrt(np.diag(cov)) / scales, np.where(_involved(weakest.vector), weakest.sigma, 0.0))
+    statuses = tuple(Status(grade(float(ratio))) for ratio in known)
+    if hopeless:  # more views of a board that is not what the target says would not help
+        return LensJudgement(statuses, (*hopeless, *reasons), projection)
     reasons += _direction_reasons(fit, c, covariance, cov, scales)
     reasons += _extrapolation_reasons(camera, views.image_size, projection)
     return LensJudgement(statuses, tuple(reasons), projection)
@@ -66,14 +73,31 @@ def _too_few_looks(fit: LensFit, c: int) -> str:
 
 def _model_reasons(camera: str, model: str, scores: Sequence[ModelScore]) -> list[Reason]:
     mine = next((score for score in scores if score.model == model), None)
-    best = min(scores, key=lambda score: score.error_px, default=None)
-    if mine is None or best is None or mine.within or not mine.error_px > _WORSE_MODEL * best.error_px:
+    best = scores[0]  # the one to choose
+    if mine is None or mine.within or not mine.error_px > _WORSE_MODEL * best.error_px:
         return []
     wrong = mine.error_px > _WRONG_MODEL * best.error_px
     text = f"on held-out views {model} errs by {mine.error_px:.2f} px, {best.model} by {best.error_px:.2f} px"
     if wrong:
         return [Reason(Verdict.FAIL, f"{camera}: {model} is the wrong model for this lens: {text}; use --model {best.model}")]
     return [Reason(Verdict.CHECK, f"{camera}: {best.model} fits this lens better: {text}")]
+
+
+def _no_model_fits(camera: str, scores: Sequence[ModelScore]) -> list[Reason]:
+    """Say that the board, not the lens, is wrong where every lens model errs alike."""
+    best = min(scores, key=lambda score: score.error_px)
+    if not best.error_px > _NO_MODEL_PX:
+        return []
+    text = f"no lens model fits, the best errs by {best.error_px:.2f} px on held-out views"
+    causes = "check rows, columns and spacing in the target file; else the board is bent, or the images smeared by motion"
+    return [Reason(Verdict.FAIL, f"{camera}: {text}: {causes}")]
+
+
+def _involved(direction: Array) -> NDArray[np.bool_]:
+    """Return which parameters a weak direction moves."""
+    share = np.abs(direction)
+    moved: NDArray[np.bool_] = share > 0.35 * share.max()
+    return moved
 
 
 def _frame_reasons(fit: LensFit, c: int) -> list[Reason]:
@@ -92,13 +116,14 @@ def _direction_reasons(fit: LensFit, c: int, covariance: Covariance, cov: Array,
     if weakest.grade == "determined":
         return []
     names = fit.problem.cameras[c].model.parameter_names
-    share = np.abs(weakest.vector)
-    involved = ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.35 * share.max())
+    moved = _involved(weakest.vector)
+    involved = ", ".join(names[i] for i in np.argsort(-np.abs(weakest.vector)) if moved[i])
     # A direction of the scaled lens, as a row vector on the lens itself.
     advice = best_view(fit, c, cov, weakest.vector / scales, covariance.variance_factor)
     remedy = f"; add views with {advice.text} (ten of them: {advice.sigma_ratio:.0%} of today's sigma)" if advice else ""
     verdict = Verdict.CHECK if weakest.grade == "weak" else Verdict.FAIL
-    text = f"{involved} together are {weakest.grade}: known to {weakest.sigma:.1f} px at the outermost corners{remedy}"
+    together = "together are" if moved.sum() > 1 else "is"
+    text = f"{involved} {together} {weakest.grade}: known to {weakest.sigma:.1f} px at the outermost corners{remedy}"
     return [Reason(verdict, f"{fit.views[c].camera}: {text}")]
 
 
@@ -108,7 +133,7 @@ def _extrapolation_reasons(camera: str, size: tuple[int, int], projection: Proje
     worst = int(np.argmax(sigma))
     if sigma[worst] <= _EXTRAPOLATED_PX:
         return []
-    empty = "" if projection.seen[worst] else "no board was seen there, and "
+    empty = "" if projection.seen[worst] else " (no board was seen there)"
     region = region_of(projection.uv[worst], size)
-    text = f"in the {region} of the image {empty}a point's pixel is known to {sigma[worst]:.1f} px only; bring the board there"
+    text = f"{region} of the image{empty}: a point's pixel is known to {sigma[worst]:.1f} px only; bring the board there"
     return [Reason(Verdict.CHECK, f"{camera}: {text}")]

@@ -61,7 +61,7 @@ def text(summary: Summary) -> str:
     lines = [*camera_lines(summary), ""] if summary.rig.cameras else []
     lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
     if summary.signals:
-        head = [("sensor", "signal", "measured", "good", "")]
+        head = [("sensor", "signal", "measured", "good", "", "seen")]
         lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))
     lines.append(f"{summary.verdict.value}")
     lines += [f"  {reason.verdict.value:5} {one_line(reason.text, 1000)}" for reason in summary.reasons]
@@ -81,7 +81,7 @@ def camera_lines(summary: Summary) -> list[str]:
             text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
             text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
         lines.append(one_line(text))
-        lines += [f"  held-out error by model: {one_line(scores)}" for scores in _model_scores(summary, name)]
+        lines += [f"  held-out error by model, outliers included: {one_line(scores)}" for scores in _model_scores(summary, name)]
     return lines
 
 
@@ -103,7 +103,14 @@ def _model_scores(summary: Summary, camera: str) -> list[str]:
         scores = models.get(camera) if isinstance(models, Mapping) else None
         if isinstance(scores, Mapping):
             errors = {model: s.get("held_out_px") for model, s in scores.items() if isinstance(s, Mapping)}
-            found.append(", ".join(f"{model} {error:.3g} px" for model, error in errors.items() if isinstance(error, float)))
+            texts = [f"{model} {error:.3g} px" for model, error in errors.items() if isinstance(error, float)]
+            asked = any(isinstance(s, Mapping) and s.get("asked") for s in scores.values())
+            chosen = (
+                ""
+                if asked
+                else f"; chosen: {summary.rig.cameras[camera].model}, the simplest of those that chance cannot tell from the best"
+            )
+            found.append(", ".join(texts) + chosen if texts else "")
     return [text for text in found if text]
 
 
@@ -114,7 +121,7 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 def _signal_cells(signal: Signal) -> tuple[str, ...]:
     unit = f" {signal.probe.unit}" if signal.probe.unit else ""
-    return (signal.sensor, signal.probe.title, f"{signal.value:.3g}{unit}", signal.probe.limit, signal.verdict.value)
+    return (signal.sensor, signal.probe.title, f"{signal.value:.3g}{unit}", signal.probe.limit, signal.mark, signal.note)
 
 
 def _table(cells: Sequence[Sequence[str]]) -> str:
@@ -158,6 +165,7 @@ def as_json(summary: Summary, pictures: Sequence[dict[str, str]] = ()) -> dict[s
                 "fail": signal.probe.bad if isfinite(signal.probe.bad) else None,
                 "smaller_is_better": signal.probe.bad >= signal.probe.good,
                 "verdict": signal.verdict.value,
+                "mark": signal.mark,
                 "note": signal.note,
             }
             for signal in summary.signals

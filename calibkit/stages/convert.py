@@ -88,7 +88,8 @@ def _held(name: str, camera: Camera, exporter: Exporter, lossy: bool) -> tuple[C
     lost = f" and {best.lost:.0%} of the image lost" if best.lost else ""
     cost = f"{best.model.name} instead of {camera.model}, off by at most {best.worst_px:.3g} px (rms {best.rms_px:.3g} px){lost}"
     if (best.worst_px > LOSSLESS_PX or best.lost) and not lossy:
-        raise BadInputError(f"{name}: {exporter.name} would hold {cost}; pass --lossy to write it all the same")
+        held = ", ".join(target.name for target in targets)
+        raise BadInputError(f"{name}: {exporter.name} would hold {cost}; calibrate again with --model {held}, or pass --lossy")
     values = dict(zip(best.model.parameter_names, best.params.tolist(), strict=True))
     return given_camera(best.model.name, values, camera.resolution, camera.topic), f"{name}: written as {cost}"
 

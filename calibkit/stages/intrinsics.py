@@ -53,6 +53,8 @@ def intrinsics(
     recording = open_recording(list(sources), options.ros_distro)
     topics = name_cameras(recording, options.cameras)
     models = _models(options.models, len(topics))
+    if options.resolution and not any(t.kind == "corners" and t.name in topics.values() for t in recording.topics):
+        raise BadInputError("--resolution is for corner files, which do not say it; images do: leave it out")
     views = observe(recording, topics, board, options, progress)
     requests = [CameraRequest(v, model, topics[v.camera]) for v, model in zip(views, models, strict=True)]
     result = calibrate_cameras(requests, options.robust, options.max_views, progress)
@@ -139,7 +141,7 @@ def _worst_frames(result: Result, recording: Recording, topics: dict[str, str], 
     ranked = sorted(ranked, reverse=True)[:_WORST_FRAMES]
     drawn: dict[tuple[str, int], Thumbnail] = {}
     for name, topic in topics.items():
-        once = Counter(labels[name])  # under a stamp that repeats, which image it was cannot be told
+        once: Counter[str] = Counter(labels[name])  # under a stamp that repeats, which image it was cannot be told
         wanted = {labels[name][i]: i for _, camera, i in ranked if camera == name and once[labels[name][i]] == 1}
         if not wanted or not any(t.name == topic and t.kind == "image" for t in recording.topics):
             continue

@@ -73,8 +73,10 @@ def _too_few_looks(fit: LensFit, c: int) -> str:
 
 def _model_reasons(camera: str, model: str, scores: Sequence[ModelScore]) -> list[Reason]:
     mine = next((score for score in scores if score.model == model), None)
+    if mine is None or mine.within:
+        return []
     best = scores[0]  # the one to choose
-    if mine is None or mine.within or not mine.error_px > _WORSE_MODEL * best.error_px:
+    if not mine.error_px > _WORSE_MODEL * best.error_px:
         return []
     wrong = mine.error_px > _WRONG_MODEL * best.error_px
     text = f"on held-out views {model} errs by {mine.error_px:.2f} px, {best.model} by {best.error_px:.2f} px"
@@ -85,8 +87,8 @@ def _model_reasons(camera: str, model: str, scores: Sequence[ModelScore]) -> lis
 
 def _no_model_fits(camera: str, scores: Sequence[ModelScore]) -> list[Reason]:
     """Say that the board, not the lens, is wrong where every lens model errs alike."""
-    best = min(scores, key=lambda score: score.error_px)
-    if not best.error_px > _NO_MODEL_PX:
+    best = min(scores, key=lambda score: score.error_px, default=None)
+    if best is None or not best.error_px > _NO_MODEL_PX:
         return []
     text = f"no lens model fits, the best errs by {best.error_px:.2f} px on held-out views"
     causes = "check rows, columns and spacing in the target file; else the board is bent, or the images smeared by motion"

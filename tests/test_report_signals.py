@@ -9,6 +9,7 @@ from report_samples import CX, CY, SIZE, residual_set, result
 from calibkit.data.verdict import Verdict
 from calibkit.report.field import _median_by, cells, over_image, over_radius
 from calibkit.report.signals import PROBES, measure, not_good
+from calibkit.report.summary import summarise, text
 from calibkit.report.view import views
 
 CENTRE = np.array([CX, CY])
@@ -116,6 +117,17 @@ def test_one_bad_frame_is_named():
     signal = signals_of(views(result(residuals=residuals, thumbnails=0))[0])["worst_frame_ratio"]
     assert signal.verdict is Verdict.CHECK
     assert signal.note.startswith("1500000000.350000: ")
+
+
+def test_a_value_beyond_its_limit_that_tells_nothing_is_not_stamped_pass():
+    residuals = residual_set(noise=0.01, outliers=0)
+    residuals.raw[residuals.context["frame"] == 7] *= 5
+    made = result(residuals=residuals, thumbnails=0)
+    signal = signals_of(views(made)[0])["worst_frame_ratio"]
+    assert signal.value > signal.probe.good
+    assert (signal.verdict, signal.mark) == (Verdict.PASS, "-")
+    (line,) = [line for line in text(summarise(made.rig, [made])).splitlines() if signal.probe.title in line]
+    assert line.endswith(f" -     {signal.note}")
 
 
 def test_what_was_not_recorded_is_not_judged():

@@ -68,6 +68,11 @@ class Signal:
     verdict: Verdict
 
     @property
+    def mark(self) -> str:
+        """The verdict in one word; "-" where the value is beyond its limit but tells nothing, as the note says."""
+        return self.verdict.value if self.probe.judge(self.value) is self.verdict else "-"
+
+    @property
     def reason(self) -> Reason:
         """The signal as a sentence of a verdict."""
         unit = f" {self.probe.unit}" if self.probe.unit else ""

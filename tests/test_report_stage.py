@@ -1,6 +1,7 @@
 """`calibkit report`: from the rig file and its residual files to words, pages and exit codes, without the recording."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from report_samples import residual_set, result
@@ -11,7 +12,7 @@ from calibkit.data.rig import Camera, Estimate, Rig
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.io.residual_file import save_residuals
-from calibkit.io.rig_file import save_rig
+from calibkit.io.rig_file import save_rig, updated
 from calibkit.stages.report import report, write_report
 
 
@@ -93,6 +94,38 @@ def test_a_missing_file_is_exit_code_2_and_writes_nothing(tmp_path, small):
         with pytest.raises(BadInputError, match="rig.intrinsics.residuals.npz" if rig == "rig.yaml" else "other.yaml"):
             report(tmp_path / rig, tmp_path / "out", tmp_path / "out.json")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml"]
+
+
+@pytest.mark.parametrize(("old", "new"), [("value: 370.0", "value: 1370.0"), ("rms_px: 0.283", "rms_px: 0.083"), ("752", "753")])
+def test_an_entry_changed_by_hand_is_refused_by_name(tmp_path, small, old, new):
+    path = tmp_path / "rig.yaml"
+    save(small, path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(BadInputError, match="^rig.yaml: cameras.cam0 was changed since intrinsics made it: .*run intrinsics again$"):
+        report(path)
+
+
+def test_the_topic_may_be_renamed_by_hand(tmp_path, small):
+    path = tmp_path / "rig.yaml"
+    save(small, path)
+    path.write_text(path.read_text().replace("topic: /cam0/image_raw", "topic: /camera"))
+    assert report(path).rig.cameras["cam0"].topic == "/camera"
+
+
+def test_residuals_of_an_entry_that_a_later_stage_made_anew_are_left_out(tmp_path, small):
+    """The older stage's FAIL and residuals of cam0 are no longer those of the rig."""
+    older = result(residuals=residual_set(frames=12, noise=1.5), thumbnails=0, reasons=(Reason(Verdict.FAIL, "cam0: bad"),))
+    camera = older.rig.cameras["cam0"]
+    worse = {**camera.parameters, "fx": camera.parameters["fx"].model_copy(update={"value": 500.0})}
+    older = replace(older, rig=older.rig.model_copy(update={"cameras": {"cam0": camera.model_copy(update={"parameters": worse})}}))
+    first = save(older, tmp_path / "old.yaml")
+    last = save(replace(small, stage="joint"), tmp_path / "rig.yaml")
+    save_rig(updated(first, last), tmp_path / "rig.yaml", force=True)
+    summary = report(tmp_path / "rig.yaml")
+    assert [view.stage for view in summary.views] == ["joint"]
+    assert summary.verdict is Verdict.PASS
 
 
 def test_an_existing_report_is_kept_unless_forced(tmp_path, small):

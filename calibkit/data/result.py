@@ -46,6 +46,7 @@ class Result:
     facts: dict[str, object] = field(default_factory=dict)  # stage-specific, JSON-ready, for --json and the report
     thumbnails: tuple[Thumbnail, ...] = ()
     not_observable: tuple[str, ...] = ()  # names of what was asked for and cannot be known from this recording
+    made: dict[str, str] = field(default_factory=dict)  # of a result read back: the hash of each rig entry that it made, by key
 
     @property
     def verdict(self) -> Verdict:

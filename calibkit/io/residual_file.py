@@ -69,6 +69,20 @@ class _Header(BaseModel):
     reasons: list[tuple[Verdict, str]]
     not_observable: list[str]
     facts: Annotated[dict[str, JsonValue], AfterValidator(_finite)]
+    made: dict[str, str] = {}  # what the residuals belong to: see `entry_hashes`
+
+
+def entry_hashes(rig: Rig) -> dict[str, str]:
+    """Return the sha256 of every entry of the rig by key (`cameras.cam0`), without what may be renamed by hand: topic and equation."""
+    entries = {
+        f"{section}.{name}": entry
+        for section in ("cameras", "imus", "transforms", "time_offsets")
+        for name, entry in getattr(rig, section).items()
+    }
+    texts = {
+        key: json.dumps(entry.model_dump(mode="json", exclude={"topic", "equation"}), sort_keys=True) for key, entry in entries.items()
+    }
+    return {key: hashlib.sha256(text.encode()).hexdigest() for key, text in texts.items()}
 
 
 def save_residuals(result: Result, rig_path: Path) -> tuple[str, str]:
@@ -131,6 +145,7 @@ def _pack(result: Result) -> bytes:
             "reasons": [(reason.verdict, reason.text) for reason in result.reasons],
             "not_observable": list(result.not_observable),
             "facts": result.facts,
+            "made": entry_hashes(result.rig),
         }
     )
     entries = {HEADER: json.dumps(header.model_dump(mode="json"), ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()}
@@ -204,6 +219,7 @@ def _unpack(data: bytes, rig: Rig) -> Result:
         facts=dict(header.facts),
         thumbnails=tuple(thumbnails),
         not_observable=tuple(header.not_observable),
+        made=dict(header.made),
     )
 
 

@@ -1,13 +1,14 @@
 """The report of any result: from the stage that just made it, or later from the rig file and its residual files, without the recording."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig, StageRun
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.atomic import refuse_existing, write_atomic, write_json
-from calibkit.io.residual_file import load_result
+from calibkit.io.residual_file import entry_hashes, load_result
 from calibkit.io.rig_file import load_rig
 from calibkit.report.summary import Summary, as_json, summarise
 
@@ -24,7 +25,7 @@ def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None =
     if json_path is not None:
         refuse_existing(json_path, force)
     rig = load_rig(rig_path)
-    results = [load_result(rig_path, rig, run) for run in _latest_runs(rig)]
+    results = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
     summary = summarise(rig, results)
     if out_dir is not None:
         _write_pages(summary, out_dir)
@@ -52,6 +53,37 @@ def check_out_dir(out_dir: Path, force: bool = False) -> None:
 def _latest_runs(rig: Rig) -> list[StageRun]:
     """Return the runs whose residual files the rig still stands for: a later run of the same stage has replaced the earlier one's file."""
     return list({run.residual_file: run for run in rig.provenance if run.residual_file is not None}.values())
+
+
+def _current(results: list[Result], rig_path: Path) -> list[Result]:
+    """Return what the results, oldest first, say of entries that no later one has made anew.
+
+    BadInputError for an entry that was changed since it was made.
+    """
+    owner = {key: result for result in results for key in result.made}
+    if not results:
+        return []
+    found = entry_hashes(results[0].rig)
+    for key, result in owner.items():
+        if key in found and found[key] != result.made[key]:
+            stage = one_line(result.stage, 40)
+            raise BadInputError(
+                f"{rig_path.name}: {one_line(key, 80)} was changed since {stage} made it: "
+                f"its residuals no longer belong to it; run {stage} again"
+            )
+    return [
+        _without(result, {key.split(".", 1)[-1] for key, made in result.made.items() if owner[key].made[key] != made}) for result in results
+    ]
+
+
+def _without(result: Result, parts: set[str]) -> Result:
+    """Return the result without what it says of these parts of the rig."""
+    return replace(
+        result,
+        residuals=tuple(residuals for residuals in result.residuals if residuals.sensor not in parts),
+        reasons=tuple(reason for reason in result.reasons if reason.text.split(":")[0] not in parts),
+        not_observable=tuple(name for name in result.not_observable if name.split(".")[0] not in parts),
+    )
 
 
 def _write_pages(summary: Summary, out_dir: Path) -> None:

@@ -127,6 +127,17 @@ def test_tags_with_foreign_codes_or_in_foreign_places_are_not_reported() -> None
     assert np.linalg.norm(found.uv - truth[found.corner], axis=1).max() < WRONG_PX
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(5, 6), (7, 6), (7, 5)])
+def test_tags_that_contradict_the_layout_are_counted(columns: int, rows: int) -> None:
+    image, _ = frame(np.random.default_rng(3))
+    right, wrong = detect(image, BOARD).tags, detect(image, AprilGrid(columns, rows, 0.088, 0.3)).tags
+    assert right.on_board >= 12
+    assert right.misplaced == right.foreign == 0
+    assert wrong.misplaced > 0.5 * wrong.on_board
+    assert wrong.on_board + wrong.foreign == right.on_board
+    assert bool(wrong.foreign) == (columns * rows < 36)
+
+
 def test_a_lone_tag_is_no_board_and_no_image_is_too_odd() -> None:
     tag = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).generateImageMarker(7, 80, borderBits=2)
     lone = np.full((240, 320), 220, np.uint8)

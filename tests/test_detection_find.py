@@ -4,6 +4,7 @@ import multiprocessing
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from calibkit.data.progress import silent
 from calibkit.detection import find
 from calibkit.detection.cache import CornerCache
 from calibkit.detection.find import find_boards
-from calibkit.detection.found import NOTHING, Detection
+from calibkit.detection.found import NOTHING, Detection, Tags
 from calibkit.errors import BadInputError
 from calibkit.models.board import AprilGrid, Checkerboard
 from calibkit.models.cameras import CAMERAS
@@ -67,6 +68,20 @@ def test_the_odd_size_is_named(images: list[NDArray[np.uint8]]) -> None:
         find_boards(frames([*images[:3], np.zeros((100, 200), np.uint8), *images[3:]]), BOARD, "cam0", None, silent)
 
 
+def test_an_odd_size_ends_the_search(images: list[NDArray[np.uint8]]) -> None:
+    taken = 0
+
+    def many() -> Iterator[ImageFrame]:
+        nonlocal taken
+        for image in [np.zeros((100, 200), np.uint8), *images * 20]:
+            taken += 1
+            yield frames([image])[0]
+
+    with pytest.raises(BadInputError, match="is 200x100, most others are 320x240"):
+        find_boards(many(), BOARD, "cam0", None, silent)
+    assert taken <= 3 + 3 * (find.os.cpu_count() or 1)
+
+
 def test_no_images_at_all() -> None:
     views = find_boards([], BOARD, "cam0", None, silent)
     assert (views.n_images, views.n_frames, views.image_size) == (0, 0, (0, 0))
@@ -111,7 +126,29 @@ def test_second_run_decodes_nothing(images: list[NDArray[np.uint8]], tmp_path: P
         assert cache.get(cache.key(sealed[0].payload, AprilGrid(4, 3, 0.089, 0.3)), BOARD) is None, "another board is another key"
 
 
-ENTRY = Detection(np.array([0, 5], np.int32), np.array([[1.5, 2.5], [3.0, 4.0]]), np.array([0.02, 0.03]))
+@pytest.mark.parametrize(
+    ("tags", "refused", "warnings"),
+    [
+        ([Tags(30, 24, 6)] * 3, True, 0),
+        ([Tags(30, 0)] * 3, False, 0),
+        ([Tags(20, 10), Tags(30, 0), Tags(30, 0)], False, 1),  # one image of another board
+        ([Tags(30, 0, 6)] * 3, False, 1),
+    ],
+)
+def test_a_layout_that_most_images_contradict_is_refused(
+    images: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch, tags: list[Tags], refused: bool, warnings: int
+) -> None:
+    answers = iter(tags)
+    monkeypatch.setattr(find, "detect", lambda image, board: replace(NOTHING, tags=next(answers)))
+    asked = frames(images[:3])
+    if refused:
+        with pytest.raises(BadInputError, match=r"80% of the tags found \(72 of 90\) .* check its tagCols"):
+            find_boards(asked, BOARD, "cam0", None, silent)
+    else:
+        assert len(find_boards(asked, BOARD, "cam0", None, silent).warnings) == warnings
+
+
+ENTRY = Detection(np.array([0, 5], np.int32), np.array([[1.5, 2.5], [3.0, 4.0]]), np.array([0.02, 0.03]), Tags(4, 1, 2))
 
 
 def test_damaged_or_foreign_entries_are_misses(tmp_path: Path) -> None:

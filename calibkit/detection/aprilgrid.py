@@ -4,14 +4,14 @@ Each tag next to known ones is predicted by its neighbourhood (so that a lens ma
 verified. No tag is believed for its own sake: it must lie where its neighbours say, and carry its own code.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.detection import april_tags
 from calibkit.detection.corner_fit import Smoothed, saddle, smooth, symmetry
-from calibkit.detection.found import NOTHING, Detection, Image, to_8_bit
+from calibkit.detection.found import NOTHING, Detection, Image, Tags, to_8_bit
 from calibkit.detection.plane_maps import apply, homographies, in_line, local_maps, predict
 from calibkit.errors import BadInputError
 from calibkit.models.board import AprilGrid
@@ -36,23 +36,29 @@ def detect(image: Image, board: AprilGrid) -> Detection:
         )
     xy = (board.points[:, :2] / board.tag_size).reshape(-1, 4, 2)
     smoothed = smooth(image)
+    read = Tags()
     for tags, corners in april_tags.seeds(to_8_bit(image)):
-        seed, seen = _read(smoothed, n, tags, corners)
-        if not seen.any():
-            continue
+        seed, seen = _read(smoothed, tags, corners)
+        foreign = int(seen[n:].sum())
+        seed, seen = seed[:n], seen[:n]
         uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed, seen)
-        if fitted.any(1).sum() >= 2:
-            return _finish(smoothed, xy, board.spacing, uv, fitted)
-    return NOTHING
+        known = fitted.any(1)
+        if known.sum() >= 2:
+            counts = Tags(int(seen.sum()), int((seen & ~known).sum()), foreign)
+            return replace(_finish(smoothed, xy, board.spacing, uv, fitted), tags=counts)
+        counts = Tags(int(seen.sum()), max(int(seen.sum()) - 1, 0), foreign)  # no two agree; a lone one contradicts nothing
+        read = max(read, counts, key=lambda tags: tags.on_board + tags.foreign)
+    return replace(NOTHING, tags=read)
 
 
-def _read(image: Smoothed, n_tags: int, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
-    """Return the corners (t, 4, 2) of first guesses that hold up, four saddles and the code, NaN elsewhere; and which tags (t,) do."""
-    on_board = tags < n_tags
-    tags, corners = tags[on_board], corners[on_board]
+def _read(image: Smoothed, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
+    """Return the corners (t, 4, 2) of first guesses that hold up, four saddles and the code, NaN elsewhere; and which tags (t,) do.
+
+    Of all tags there are, those that the board does not have too.
+    """
     corners, ok = _fit(image, corners, _WIDE)
     good = ok.all(1) & april_tags.verify(image, tags, corners)
-    seed, seen = np.full((n_tags, 4, 2), np.nan), np.zeros(n_tags, bool)
+    seed, seen = np.full((april_tags.N_TAGS, 4, 2), np.nan), np.zeros(april_tags.N_TAGS, bool)
     seed[tags[good]], seen[tags[good]] = corners[good], True
     return seed, seen
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import astuple
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,15 +20,15 @@ import numpy as np
 import platformdirs
 
 from calibkit.detection.boards import VERSION
-from calibkit.detection.found import Detection
+from calibkit.detection.found import Detection, Tags
 from calibkit.models.board import Board
 from calibkit.opencv import cv2
 
 T = TypeVar("T")
 Entry = tuple[tuple[int, int], Detection]  # image width and height, what was found
 
-_HEADER = struct.Struct("<4sIII")
-_MAGIC = b"ckc1"
+_HEADER = struct.Struct("<4s6I")
+_MAGIC = b"ckc2"
 _MAX_BYTES = 512 * 2**20
 _ROW = np.dtype([("corner", "<i4"), ("u", "<f8"), ("v", "<f8"), ("sigma", "<f8")])
 
@@ -133,7 +134,7 @@ class CornerCache:
 def _pack(size: tuple[int, int], found: Detection) -> bytes:
     rows = np.empty(len(found.corner), _ROW)
     rows["corner"], rows["u"], rows["v"], rows["sigma"] = found.corner, found.uv[:, 0], found.uv[:, 1], found.sigma_px
-    body = _HEADER.pack(_MAGIC, *size, len(rows)) + rows.tobytes()
+    body = _HEADER.pack(_MAGIC, *size, len(rows), *astuple(found.tags)) + rows.tobytes()
     return hashlib.sha256(body).digest()[:8] + body
 
 
@@ -141,11 +142,12 @@ def _unpack(value: bytes, n_points: int) -> Entry | None:
     checksum, body = value[:8], value[8:]
     if len(body) < _HEADER.size or hashlib.sha256(body).digest()[:8] != checksum:
         return None
-    magic, width, height, n = _HEADER.unpack_from(body)
+    magic, width, height, n, *tags = _HEADER.unpack_from(body)
     if magic != _MAGIC or len(body) != _HEADER.size + n * _ROW.itemsize or n > n_points:
         return None
     rows = np.frombuffer(body, _ROW, offset=_HEADER.size)
-    found = Detection(rows["corner"].astype(np.int32), np.stack([rows["u"], rows["v"]], axis=-1).astype(float), rows["sigma"].astype(float))
+    uv = np.stack([rows["u"], rows["v"]], axis=-1).astype(float)
+    found = Detection(rows["corner"].astype(np.int32), uv, rows["sigma"].astype(float), Tags(*tags))
     in_range = np.all((found.corner >= 0) & (found.corner < n_points)) and len(np.unique(found.corner)) == n
     if not (in_range and np.isfinite(found.uv).all() and np.isfinite(found.sigma_px).all() and np.all(found.sigma_px > 0)):
         return None

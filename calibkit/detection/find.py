@@ -2,9 +2,9 @@
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -13,7 +13,7 @@ from calibkit.data.observations import BoardViews, ImageFrame
 from calibkit.data.progress import Progress
 from calibkit.detection.boards import detect
 from calibkit.detection.cache import CornerCache, Entry
-from calibkit.detection.found import NOTHING
+from calibkit.detection.found import NOTHING, Tags
 from calibkit.errors import BadInputError, one_line
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.opencv import cv2
@@ -22,6 +22,8 @@ from calibkit.opencv import cv2
 # perspective bend the pattern, and more for circles, whose middles perspective moves.
 BIAS_PX = {AprilGrid.kind: 0.01, Checkerboard.kind: 0.01, Charuco.kind: 0.01, CircleGrid.kind: 0.03}
 _NAMED = 3  # broken images named one by one
+_WRONG_LAYOUT = 0.25  # of the tags in an image: one column too many misplaces four fifths, a right target hardly any
+_STRAY = 0.05  # of all tags, worth a warning
 Outcome = tuple[int, str, "Entry | BadInputError"]  # stamp, label, what came of the frame
 
 
@@ -29,14 +31,15 @@ def find_boards(
     frames: Iterable[ImageFrame], board: Board, camera: str, cache: CornerCache | None, progress: Progress, total: int | None = None
 ) -> BoardViews:
     """Return the board's corners in every frame that shows it; frames that cannot be decoded are counted and named in the warnings."""
-    outcomes = list(progress(_in_order(frames, board, cache), f"boards in {camera}", total))
+    outcomes = list(progress(_of_one_size(_in_order(frames, board, cache), camera), f"boards in {camera}", total))
     broken = [f"{label}: {result}" for _, label, result in outcomes if isinstance(result, BadInputError)]
     seen = [(t_ns, label, *result) for t_ns, label, result in outcomes if not isinstance(result, BadInputError)]
     shown = [(t_ns, label, found) for t_ns, label, _, found in seen if len(found.corner)]
     found = [detection for _, _, detection in shown] or [NOTHING]
+    about_tags = _about_tags([detection.tags for *_, detection in seen], camera)
     return BoardViews(
         board=board,
-        image_size=_one_size(camera, [(label, size) for _, label, size, _ in seen]),
+        image_size=_one_size([(label, size) for _, label, size, _ in seen], camera),
         t_ns=np.array([t_ns for t_ns, _, _ in shown], np.int64),
         labels=tuple(label for _, label, _ in shown),
         frame=np.repeat(np.arange(len(found), dtype=np.int32), [len(detection.corner) for detection in found]),
@@ -46,11 +49,26 @@ def find_boards(
         camera=camera,
         sigma_bias_px=BIAS_PX[board.kind],
         n_images=len(outcomes),
-        warnings=_about_broken(broken, len(outcomes)),
+        warnings=_about_broken(broken, len(outcomes)) + about_tags,
     )
 
 
-def _one_size(camera: str, sizes: list[tuple[str, tuple[int, int]]]) -> tuple[int, int]:
+def _of_one_size(outcomes: Generator[Outcome, None, None], camera: str) -> Iterator[Outcome]:
+    """Pass outcomes on, and stop at the first image of another size; three images tell which of two sizes is the odd one."""
+    sizes: list[tuple[str, tuple[int, int]]] = []
+    odd = False
+    with closing(outcomes):  # what is under way is dropped
+        for outcome in outcomes:
+            _, label, result = outcome
+            if not isinstance(result, BadInputError):
+                sizes.append((label, result[0]))
+                odd = odd or result[0] != sizes[0][1]
+                if odd and len(sizes) >= 3:
+                    _one_size(sizes, camera)
+            yield outcome
+
+
+def _one_size(sizes: list[tuple[str, tuple[int, int]]], camera: str) -> tuple[int, int]:
     """Return the size that all images share; the odd one out is named."""
     counts = Counter(size for _, size in sizes)
     if not counts:
@@ -73,7 +91,30 @@ def _about_broken(broken: list[str], n_images: int) -> tuple[str, ...]:
     return (f"{len(broken)} of {n_images} images could not be read: {named}{more}",)
 
 
-def _in_order(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None) -> Iterator[Outcome]:
+def _about_tags(tags: list[Tags], camera: str) -> tuple[str, ...]:
+    """Refuse a layout that most images contradict, as a wrong tagCols does: what is left fits together, and would calibrate well."""
+    read = [t for t in tags if t.on_board >= 2]
+    total, misplaced = sum(t.on_board for t in read), sum(t.misplaced for t in read)
+    if 2 * sum(t.misplaced > _WRONG_LAYOUT * t.on_board for t in read) > len(read) and misplaced > _WRONG_LAYOUT * total:
+        raise BadInputError(
+            f"{camera}: {misplaced / total:.0%} of the tags found ({misplaced} of {total}) are not where the target file says: "
+            "check its tagCols, tagRows and tagSpacing"
+        )
+    foreign, every = sum(t.foreign for t in tags), sum(t.on_board + t.foreign for t in tags)
+    warnings = []
+    if misplaced > _STRAY * total:
+        warnings.append(
+            f"{misplaced} of {total} tags found are not where the target file says, and are left out: is another board in view?"
+        )
+    if foreign > _STRAY * every:
+        warnings.append(
+            f"{foreign} of {every} tags found have numbers that the target does not have, and are left out: "
+            "check its tagCols and tagRows, or is another board in view?"
+        )
+    return tuple(warnings)
+
+
+def _in_order(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None) -> Generator[Outcome, None, None]:
     """Yield each frame's outcome in the frames' order, at most a few frames per worker under way."""
     workers = os.cpu_count() or 1
     waiting: deque[Future[Outcome]] = deque()

@@ -12,12 +12,22 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
+class Tags:
+    """How many tags were read in an image by their own codes, and how many of them contradict the board's layout."""
+
+    on_board: int = 0  # with numbers that the board has
+    misplaced: int = 0  # of those, not where the others and the layout put them
+    foreign: int = 0  # with numbers that the board does not have
+
+
+@dataclass(frozen=True)
 class Detection:
     """Corners of one board in one image; empty where there is none. Pixel (0, 0) is the centre of the top-left pixel."""
 
     corner: NDArray[np.int32]  # (n,) index into board.points
     uv: NDArray[np.float64]  # (n, 2) px
     sigma_px: NDArray[np.float64]  # (n,) px per coordinate
+    tags: Tags = Tags()  # of an AprilGrid, which numbers its tags by their codes
 
 
 NOTHING = Detection(np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0))

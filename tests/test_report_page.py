@@ -63,6 +63,7 @@ def test_one_page_that_needs_nothing_from_outside():
         "report.json",
     ]
     assert html.index("Parameters") < html.index("Signals") < html.index("Residual scatter") < html.index("Worst frames")
+    assert "<title>PASS · intrinsics of rig.bag · calibkit report</title>" in html
 
 
 def test_a_thousand_frames_stay_below_three_megabytes():

@@ -4,6 +4,7 @@ A new picture is one function (Figure, View) and one line in PICTURES. Dark on w
 """
 
 import io
+import textwrap
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ def _frames(figure: Figure, view: View) -> None:
     axes.axhline(middle, color="black", lw=0.8, ls="--")
     axes.set(xlabel="frame, in the order of the recording", ylabel=f"rms ({view.unit})", xlim=(-0.7, n - 0.3), ylim=(0, None))
     named = ", ".join(f"{view.labels[i]} ({values[i]:.3g})" for i in worst if np.isfinite(values[i]))
-    axes.set_title(f"median {middle:.3g} {view.unit} (dashed); worst: {named}")
+    axes.set_title(textwrap.fill(f"median {middle:.3g} {view.unit} (dashed); worst: {named}", 105))
 
 
 def _frame_image(axes: Axes, view: View) -> None:
@@ -198,7 +199,7 @@ PICTURES = (
             "Every cell should hold corners and the tilts should reach past 30 deg; where a cell shows a dash, the lens is extrapolated.",
             _PIXELS | {"image_size"}, 3.4, _coverage),
     Picture("frames", "Rms of each frame",
-            "Bars of about one height are good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or mount "
-            "that drifts.",
+            "About one height from frame to frame is good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or "
+            "mount that drifts.",
             _PIXELS | {"frame"}, 2.6, _frames),
 )  # fmt: skip

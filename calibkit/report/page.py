@@ -11,6 +11,7 @@ from calibkit.data.rig import CONVENTIONS
 from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import draw
+from calibkit.report.parameters import SIGMA_NOTE
 from calibkit.report.summary import Summary, as_json, camera_lines
 from calibkit.version import __version__
 
@@ -40,10 +41,20 @@ def build(summary: Summary) -> dict[str, bytes]:
         sections=sections,
         thumbnails=thumbnails,
         conventions=CONVENTIONS,
+        about=_about(summary),
+        sigma_note=SIGMA_NOTE,
         version=__version__,
     )
     data = json.dumps(as_json(summary, pictures), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     return {**images, "report.html": page.encode(), "report.json": data.encode()}  # in the order of writing: what points to others last
+
+
+def _about(summary: Summary) -> str:
+    """Return which stages of which inputs the page tells of."""
+    runs = summary.rig.provenance
+    stages = ", ".join(dict.fromkeys(run.stage for run in runs)) or "rig"
+    names = ", ".join(dict.fromkeys(file.name for run in runs for file in run.inputs))
+    return f"{stages} of {names}" if names else stages
 
 
 def _template() -> Template:

@@ -11,6 +11,11 @@ from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
 
+SIGMA_NOTE = (
+    "sigma is one standard deviation, plain takes corners as independent; factor is their ratio: it covers errors that neighbouring "
+    "frames share and what the detector always errs by at one place of the image."
+)
+
 
 @dataclass(frozen=True)
 class Row:

@@ -9,7 +9,7 @@ from calibkit.data.result import Result
 from calibkit.data.rig import Rig
 from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import one_line
-from calibkit.report.parameters import Row, parts, rig_reasons, rows
+from calibkit.report.parameters import SIGMA_NOTE, Row, parts, rig_reasons, rows
 from calibkit.report.signals import Signal, measure, not_good
 from calibkit.report.view import View, views
 
@@ -60,6 +60,8 @@ def text(summary: Summary) -> str:
     """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
     lines = [*camera_lines(summary), ""] if summary.rig.cameras else []
     lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
+    if any(row.factor for row in summary.parameters):
+        lines.append(f"{SIGMA_NOTE}\n")
     if summary.signals:
         head = [("sensor", "signal", "measured", "good", "", "seen")]
         lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))

@@ -70,6 +70,16 @@ def test_a_checkerboard_of_odd_sum_has_one_frame(board: Checkerboard, roll: floa
     assert np.abs(found.uv - truth).max() < 0.2
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(6, 5), (11, 6), (8, 8), (13, 8)])
+def test_another_size_of_checkerboard_is_not_found(columns: int, rows: int) -> None:
+    shown = Checkerboard(12, 8, 0.05, 0.05)
+    image = Renderer(CAMERA, shown, RenderStyle()).render(
+        place_board(shown, so3.exp(np.array([0.2, 0.1, 0.1])), np.array([0.0, 0.0, 0.9])), np.random.default_rng(0)
+    )
+    assert len(detect(image, shown).corner) == len(shown.points)
+    assert len(detect(image, Checkerboard(columns, rows, 0.05, 0.05)).corner) == 0
+
+
 def test_charuco_in_part_keeps_its_numbers() -> None:
     board = Charuco(8, 7, 0.05, 0.037, "DICT_5X5_100")
     T = place_board(board, np.eye(3), np.array([0.0, 0.0, 0.6]))

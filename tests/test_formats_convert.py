@@ -109,7 +109,7 @@ def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
         (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "a" / "b"), "b: cannot be made"),
         (("import", tmp_path / "rig.yaml", "-o", tmp_path / "x.yaml"), "is a rig file already"),
         (("import", out, "-o", tmp_path / "x.yaml"), "out: is not a file"),
-        (("import", out / "imu.yaml", out / "imu.yaml", "-o", out / "no" / "x.yaml"), "its folder does not exist"),
+        (("import", out / "imu.yaml", out / "imu.yaml", "-o", out / "no" / "x.yaml"), "there is no folder"),
     ]:
         assert command(monkeypatch, *arguments) == 2
         message = capsys.readouterr().err

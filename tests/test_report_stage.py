@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from report_samples import residual_set, result
@@ -13,6 +14,7 @@ from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.io.residual_file import save_residuals
 from calibkit.io.rig_file import save_rig, updated
+from calibkit.stages.outputs import Outputs
 from calibkit.stages.report import report, write_report
 
 
@@ -103,7 +105,7 @@ def test_an_entry_changed_by_hand_is_refused_by_name(tmp_path, small, old, new):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(BadInputError, match="^rig.yaml: cameras.cam0 was changed since intrinsics made it: .*run intrinsics again$"):
+    with pytest.raises(BadInputError, match=r"^rig.yaml: cameras.cam0 was changed since intrinsics made it: .*run intrinsics again$"):
         report(path)
 
 
@@ -140,6 +142,20 @@ def test_an_existing_report_is_kept_unless_forced(tmp_path, small):
     assert page.read_text() != "mine"
     with pytest.raises(BadInputError, match="is a file"):
         report(tmp_path / "rig.yaml", tmp_path / "rig.yaml")
+
+
+def test_where_nothing_can_be_written_is_told_by_the_name_that_was_given(tmp_path, monkeypatch):
+    """Before any work: neither the rig file nor the residuals' name is looked at."""
+    monkeypatch.chdir(tmp_path)
+    for field in ("out", "json"):
+        with pytest.raises(BadInputError, match=r"^no/a.yaml: there is no folder .*/no; make it first$"):
+            Outputs(**{field: Path("no/a.yaml")}, rigs=(Path("gone.yaml"),)).open()
+        with pytest.raises(BadInputError, match=r"^-: .*name of a file"):
+            Outputs(**{field: Path("-")}).open()
+    (tmp_path / "file").touch()
+    with pytest.raises(BadInputError, match=r"^file/a.yaml: cannot be written \(Not a directory\)"):
+        Outputs(out=Path("file/a.yaml")).open()
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_text_from_files_cannot_drive_the_terminal(tmp_path):

@@ -42,6 +42,8 @@ def _show(result: "Info") -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from calibkit.estimation.doctor import counted
+
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = 200  # a log has no width to fit
@@ -59,11 +61,12 @@ def _show(result: "Info") -> None:
     console.print(table)
     for t in result.topics:
         if t.image:
-            found = f"brightness {t.image.brightness:.0%}, sharpness {t.image.sharpness:.2f} (median of {t.image.sampled} images)"
-            console.print(Text(f"  note     {t.topic.name}: {found}"), soft_wrap=True)
+            images = counted(t.image.sampled, "image", "images")
+            found = f"brightness {100 * t.image.brightness:.0f} % of white, sharpness {t.image.sharpness:.2f} (falls with blur)"
+            console.print(Text(f"  note     {t.topic.name}: {found}, median of {images}"), soft_wrap=True)
     for name, finding in [(t.topic.name, f) for t in result.topics for f in t.findings] + [("recording", f) for f in result.findings]:
         console.print(Text(f"  {'PROBLEM' if finding.problem else 'note   '}  {name}: {finding.text}"), soft_wrap=True)
     for warning in result.warnings:
         console.print(Text(f"  reading  {warning}"), soft_wrap=True)
-    problems = "1 problem" if result.problems == 1 else f"{result.problems} problems"
-    console.print(Text(f"{', '.join(result.sources)}: {len(result.topics)} topics, {result.duration_s:.2f} s, {problems}"), soft_wrap=True)
+    topics, problems = counted(len(result.topics), "topic", "topics"), counted(result.problems, "problem", "problems")
+    console.print(Text(f"{', '.join(result.sources)}: {topics}, {result.duration_s:.2f} s, {problems}"), soft_wrap=True)

@@ -34,6 +34,11 @@ class Finding:
     text: str
 
 
+def counted(n: int, one: str, many: str) -> str:
+    """Return how many there are, in the words for one or for many."""
+    return f"{n} {one if n == 1 else many}"
+
+
 def rate_hz(t_ns: Times) -> float | None:
     """Return the rate by the median interval; None where times do not advance."""
     steps = np.diff(t_ns)
@@ -47,9 +52,9 @@ def check_times(t_ns: Times) -> list[Finding]:
     steps = np.diff(t_ns) * 1e-9
     back, same = int(np.sum(steps < 0)), int(np.sum(steps == 0))
     if back:
-        found.append(Finding("disorder", True, f"{back} stamps go back in time, by up to {-steps.min():.6g} s"))
+        found.append(Finding("disorder", True, f"{counted(back, 'stamp goes', 'stamps go')} back in time, by up to {-steps.min():.6g} s"))
     if same:
-        found.append(Finding("duplicate", True, f"{same} stamps repeat the one before"))
+        found.append(Finding("duplicate", True, f"{counted(same, 'stamp repeats', 'stamps repeat')} the one before"))
     steps = steps[steps > 0]
     if len(steps) < 10:
         return found
@@ -60,11 +65,13 @@ def check_times(t_ns: Times) -> list[Finding]:
         longest = int(np.argmax(np.diff(t_ns)))
         at, length = (t_ns[longest] - t_ns[0]) * 1e-9, (t_ns[longest + 1] - t_ns[longest]) * 1e-9
         lost = int(np.sum(np.rint(steps[missing] / typical) - 1))
-        text = f"{np.sum(missing)} gaps, about {lost} samples missing; the longest {length:.3g} s at {at:.3f} s from the start"
+        gaps, samples = counted(int(np.sum(missing)), "gap", "gaps"), counted(lost, "sample", "samples")
+        text = f"{gaps}, about {samples} missing; the longest {length:.3g} s at {at:.3f} s from the start"
         found.append(Finding("gap", bool(length > max(_LONG_GAP_S, 5 * typical)), text))
     odd = (np.abs(steps - typical) > max(8 * spread, 0.25 * typical)) & ~missing
     if odd.any() and spread < _JITTER * typical:
-        found.append(Finding("irregular", True, f"{np.sum(odd)} intervals are off by more than {max(8 * spread, 0.25 * typical):.3g} s"))
+        intervals = counted(int(np.sum(odd)), "interval is", "intervals are")
+        found.append(Finding("irregular", True, f"{intervals} off by more than {max(8 * spread, 0.25 * typical):.3g} s"))
     if spread >= _JITTER * typical:
         found.append(
             Finding("jitter", True, f"intervals scatter by {spread * 1e3:.3g} ms around {typical * 1e3:.4g} ms: stamped on arrival?")
@@ -197,7 +204,11 @@ def check_frozen(values: Array) -> list[Finding]:
     if len(repeated) < 10 or np.mean(repeated) < _FROZEN:
         return []
     return [
-        Finding("repeated", True, f"{np.mean(repeated):.1%} of the samples repeat the one before: the driver runs faster than the sensor")
+        Finding(
+            "repeated",
+            True,
+            f"{100 * np.mean(repeated):.1f} % of the samples repeat the one before: the driver runs faster than the sensor",
+        )
     ]
 
 
@@ -222,7 +233,9 @@ def check_images(bright: Array, sharp: Array) -> list[Finding]:
     dark, blown, blurred = np.sum(bright < _DARK), np.sum(bright > 1 - _DARK), np.sum(sharp < _BLURRED * np.quantile(sharp, 0.9))
     if dark:
         found.append(
-            Finding("dark", bool(dark > len(bright) / 2), f"{dark} of {len(bright)} sampled images are dark (mean below {_DARK:.0%})")
+            Finding(
+                "dark", bool(dark > len(bright) / 2), f"{dark} of {len(bright)} sampled images are dark (mean below {100 * _DARK:.0f} %)"
+            )
         )
     if blown:
         found.append(Finding("overexposed", bool(blown > len(bright) / 2), f"{blown} of {len(bright)} sampled images are overexposed"))

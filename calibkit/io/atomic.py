@@ -5,6 +5,7 @@ import os
 import secrets
 import shutil
 import stat
+import tempfile
 from pathlib import Path
 
 from calibkit.errors import BadInputError, one_line
@@ -17,6 +18,7 @@ def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> N
         target = Path(os.path.realpath(path))  # through links, so that the link stays one
         temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
         refuse_existing(target, overwrite)
+        _refuse_no_folder(path)
         try:
             _write_synced(temporary, content.encode() if isinstance(content, str) else content)
             if target.exists():
@@ -25,8 +27,6 @@ def write_atomic(path: Path, content: bytes | str, overwrite: bool = False) -> N
         finally:
             temporary.unlink(missing_ok=True)
         _sync_folder(target.parent)
-    except FileNotFoundError:
-        raise BadInputError(f"{one_line(path)}: its folder does not exist; create {one_line(target.parent)} first") from None
     except (OSError, ValueError) as error:
         raise BadInputError(f"{one_line(path)}: cannot be written ({reason_of(error)}); choose another place") from None
 
@@ -51,6 +51,25 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise BadInputError(f"{one_line(path)}: is not a regular file; give another name")
     if not overwrite:
         raise BadInputError(f"{one_line(path)}: exists already; give another name, or --force to overwrite it")
+
+
+def refuse_unwritable(path: Path, overwrite: bool) -> None:
+    """Raise BadInputError where `path` could not be written: to be asked before long work."""
+    if str(path) == "-":
+        raise BadInputError("-: output goes to files only; give the name of a file")
+    refuse_existing(path, overwrite)
+    _refuse_no_folder(path)
+    try:
+        with tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))):
+            pass
+    except (OSError, ValueError) as error:
+        raise BadInputError(f"{one_line(path)}: cannot be written ({reason_of(error)}); choose another place") from None
+
+
+def _refuse_no_folder(path: Path) -> None:
+    folder = os.path.dirname(os.path.realpath(path))
+    if not os.path.exists(folder):
+        raise BadInputError(f"{one_line(path)}: there is no folder {one_line(folder)}; make it first")
 
 
 def _write_synced(path: Path, content: bytes) -> None:

@@ -21,6 +21,7 @@ from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo
 from calibkit.models.board import Board
 
 T = TypeVar("T")
+_OPTIONS = {"image": "--camera", "corners": "--camera"}  # that choose a topic of this kind
 
 
 class Recording:
@@ -55,13 +56,15 @@ class Recording:
             if asked in candidates:
                 return asked
             found = next((topic.type for topic in self.topics if topic.name == asked), None)
-            what = f"{one_line(asked)} is {found}, not a {kind} topic" if found else f"there is no topic {one_line(asked)}"
+            wanted = f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} topic"
+            what = f"{one_line(asked)} is {found}, not {wanted}" if found else f"there is no topic {one_line(asked)}"
             raise BadInputError(f"{self.name}: {what}; {offered}")
         if len(candidates) == 1:
             return candidates[0]
         if kind == "image" and not candidates:
             self._refuse_video([topic for topic in self.topics if topic.kind == "video"])
-        raise BadInputError(f"{self.name}: " + (f"which {kind} topic? {offered}" if candidates else offered))
+        remedy = f"; choose with {_OPTIONS[kind]}" if kind in _OPTIONS else ""
+        raise BadInputError(f"{self.name}: " + (f"which {kind} topic? {offered}{remedy}" if candidates else offered))
 
     def _refuse_video(self, topics: list[TopicInfo]) -> None:
         if topics and topics[0].kind == "video":

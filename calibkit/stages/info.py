@@ -10,7 +10,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation import doctor
 from calibkit.estimation.doctor import Finding
-from calibkit.io.atomic import refuse_existing, write_json
+from calibkit.io.atomic import refuse_unwritable, write_json
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.source import Stamps, TopicInfo
 
@@ -69,7 +69,7 @@ def info(
 ) -> Info:
     """Look through a recording and write what was found as JSON where asked; BadInputError where nothing can be read."""
     if json_path is not None:
-        refuse_existing(json_path, force)
+        refuse_unwritable(json_path, force)
     recording = open_recording(sources, ros_distro)
     survey = recording.survey(progress)
     topics = [_examine(recording, topic, survey[topic.name], progress) for topic in recording.topics]

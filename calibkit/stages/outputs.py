@@ -7,8 +7,8 @@ from pathlib import Path
 from calibkit.data.result import Result
 from calibkit.data.rig import InputFile, Rig, StageRun
 from calibkit.data.verdict import worst
-from calibkit.errors import BadInputError, one_line
-from calibkit.io.atomic import refuse_existing, write_json
+from calibkit.errors import one_line
+from calibkit.io.atomic import refuse_unwritable, write_json
 from calibkit.io.residual_file import save_residuals
 from calibkit.io.rig_file import load_rig, merge_rigs, save_rig, updated
 from calibkit.report.signals import measure, not_good
@@ -31,14 +31,11 @@ class Outputs:
 
     def open(self) -> Rig:
         """Return the merged rigs; BadInputError where an output is in the way, before any work is done."""
-        for path in (self.out, self.json):
-            if path is not None and not path.parent.is_dir():
-                raise BadInputError(f"{one_line(path)}: there is no folder {one_line(path.parent)}; make it first")
         own = self.out is not None and any(self.out.exists() and rig.exists() and self.out.samefile(rig) for rig in self.rigs)
         if self.out is not None:
-            refuse_existing(self.out, self.force or own)
+            refuse_unwritable(self.out, self.force or own)
         if self.json is not None:
-            refuse_existing(self.json, self.force)
+            refuse_unwritable(self.json, self.force)
         if self.report is not None:
             check_out_dir(self.report, self.force)
         return merge_rigs([(path, load_rig(path)) for path in self.rigs])

@@ -7,7 +7,7 @@ from pathlib import Path
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig, StageRun
 from calibkit.errors import BadInputError, one_line
-from calibkit.io.atomic import refuse_existing, write_atomic, write_json
+from calibkit.io.atomic import refuse_existing, refuse_unwritable, write_atomic, write_json
 from calibkit.io.residual_file import entry_hashes, load_result
 from calibkit.io.rig_file import load_rig
 from calibkit.report.summary import Summary, as_json, summarise
@@ -23,7 +23,7 @@ def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None =
     if out_dir is not None:
         check_out_dir(out_dir, force)
     if json_path is not None:
-        refuse_existing(json_path, force)
+        refuse_unwritable(json_path, force)
     rig = load_rig(rig_path)
     results = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
     summary = summarise(rig, results)

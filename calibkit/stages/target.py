@@ -7,7 +7,7 @@ import numpy as np
 
 from calibkit.detection.artwork import artwork
 from calibkit.errors import BadInputError, one_line
-from calibkit.io.atomic import refuse_existing, write_atomic
+from calibkit.io.atomic import refuse_unwritable, write_atomic
 from calibkit.io.target_file import dump_target
 from calibkit.models.board import Board, Charuco
 from calibkit.report.board_pdf import draw_board, page_size, pdf_bytes
@@ -31,7 +31,7 @@ def print_target(board: Board, out: Path, page: str = "a4", force: bool = False)
         raise BadInputError(f"{one_line(out)}: a board is written as a PDF, give a name that ends in .pdf")
     yaml = out.with_suffix(".yaml")
     for path in (out, yaml):
-        refuse_existing(path, force)
+        refuse_unwritable(path, force)
     _refuse_absurd(board)
     shapes = artwork(board)
     x0, y0, x1, y1 = (1000 * v for v in shapes.box)

@@ -116,3 +116,10 @@ def test_command_refuses_existing_files_and_absurd_boards(tmp_path: Path) -> Non
         assert isinstance(bad.exception, BadInputError)
     assert not (tmp_path / "c.pdf").exists()
     assert not (tmp_path / "c.yaml").exists()
+
+
+def test_millimetres_given_for_metres_are_told(tmp_path):
+    with pytest.raises(BadInputError, match=r"metres, such as 0\.03$"):
+        print_target(Checkerboard(6, 5, 30.0, 30.0), tmp_path / "b.pdf")
+    with pytest.raises(BadInputError, match=r"tag size of 0.004 makes no board"):
+        print_target(AprilGrid(6, 6, 0.004, 0.3), tmp_path / "b.pdf")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from recording_helper import Make, write
 
+from calibkit.errors import BadInputError
 from calibkit.estimation import doctor
 from calibkit.geometry import so3
 from calibkit.io.recording import open_recording
@@ -250,3 +251,14 @@ def test_real_recordings(data_dir: Path) -> None:
     assert codes("euroc_imu_april") == {"gap", "no_overlap"}
     imu = open_recording([data_dir / "euroc_imu_april" / "imu0.csv"]).imu("imu0")
     assert _codes(doctor.check_gyro_unit(imu.t_ns, imu.gyro * 180 / np.pi, imu.accel)) == {"gyro_unit"}
+
+
+def test_stamps_in_the_wrong_unit_are_a_problem() -> None:
+    assert _codes(doctor.check_times(np.arange(50) * 2)) == {"rate"}
+
+
+def test_a_table_of_other_columns_is_not_taken_for_an_imu(tmp_path: Path) -> None:
+    rows = "".join(f"{0.02 * 2**i},1,2,3,4,5,6\n" for i in range(12))
+    (tmp_path / "adev.csv").write_text("# tau_s,gx_dev,gy_dev,gz_dev,ax_dev,ay_dev,az_dev (Allan deviation, overlapping)\n" + rows)
+    with pytest.raises(BadInputError, match="is not recognised"):
+        info([tmp_path / "adev.csv"])

@@ -17,6 +17,7 @@ G = 9.80665  # m/s^2
 _GAP = 1.75  # median intervals; above, a sample or more is missing
 _DAY_S = 86400  # clocks further apart do not count from the same epoch
 _LONG_GAP_S = 0.2  # above, interpolation across a gap is a guess even for a hand-held rig
+_MAX_HZ = 1e5  # above, no sensor of a rig
 _JITTER = 0.1  # robust sigma of the interval over its median
 _CLOCKS_S = 0.1  # latencies of two sensors differ by more: one clock is wrong
 _FROZEN = 0.01  # share of samples that repeat the one before
@@ -49,6 +50,9 @@ def rate_hz(t_ns: Times) -> float | None:
 def check_times(t_ns: Times) -> list[Finding]:
     """Find disorder, duplicates, gaps, single wrong stamps and jitter in the times of one stream."""
     found = []
+    rate = rate_hz(t_ns)
+    if rate is not None and rate > _MAX_HZ:
+        found.append(Finding("rate", True, f"{rate:.3g} Hz is no sensor's rate: stamps in the wrong unit?"))
     steps = np.diff(t_ns) * 1e-9
     back, same = int(np.sum(steps < 0)), int(np.sum(steps == 0))
     if back:

@@ -114,7 +114,9 @@ def _table(path: Path, name: str, warn: Callable[[str], None]) -> _Table:
     if len(body) < len(lines) - data:
         warn(f"{name}: {len(lines) - data - len(body)} lines have not {width} columns and are left out")
     header = [line.lstrip("# ").lower().split(delimiter) for line in lines[:data]]
-    titles = next((row for row in reversed(header) if len(row) == width), None) or _SHAPES.get(width, [])
+    titles = next((row for row in reversed(header) if len(row) == width), None)
+    if titles is None:  # a header that does not fit the rows names other columns: their number alone tells nothing then
+        titles = [] if delimiter and any(len(row) > width for row in header) else _SHAPES.get(width, [])
     columns, units = {}, {}
     for column, title in enumerate(titles):
         title, _, unit = title.partition("[")

@@ -60,8 +60,8 @@ class Info:
 
     @property
     def problems(self) -> int:
-        """How many findings may spoil a calibration."""
-        return sum(f.problem for f in self.findings) + sum(f.problem for t in self.topics for f in t.findings)
+        """How many findings and warnings of reading may spoil a calibration."""
+        return len(self.warnings) + sum(f.problem for f in self.findings) + sum(f.problem for t in self.topics for f in t.findings)
 
 
 def info(
@@ -98,7 +98,7 @@ def _examine(recording: Recording, topic: TopicInfo, stamps: Stamps, progress: P
     headers = stamps.header_ns if stamps.header_ns is not None and np.any(stamps.header_ns) else None
     times = stamps.record_ns if headers is None else headers[headers != 0]
     stamped = bool(np.any(times))
-    findings = []
+    findings = [] if topic.count else [Finding("empty", True, "holds no messages")]
     if topic.kind in _TIMED:
         findings += doctor.check_times(times) if stamped else []
         findings += doctor.check_headers(stamps.header_ns, stamps.record_ns) if stamps.header_ns is not None else []

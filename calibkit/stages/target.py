@@ -9,7 +9,7 @@ from calibkit.detection.artwork import artwork
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.atomic import refuse_unwritable, write_atomic
 from calibkit.io.target_file import dump_target
-from calibkit.models.board import Board, Charuco
+from calibkit.models.board import AprilGrid, Board, Charuco
 from calibkit.report.board_pdf import draw_board, page_size, pdf_bytes
 
 _MAX_CELLS = 2500  # tags, squares or circles, as in target files
@@ -52,8 +52,13 @@ def _refuse_absurd(board: Board) -> None:
     """Raise BadInputError before anything is drawn that no page could hold."""
     lengths = {name: value for name, value in vars(board).items() if isinstance(value, float)}
     for name, value in lengths.items():
-        if not 1e-4 <= value <= 100:
-            raise BadInputError(f"{name.replace('_', ' ')} of {value:g} makes no board: lengths are in metres, such as 0.03")
+        ratio = isinstance(board, AprilGrid) and name == "spacing"
+        low, high = (1e-4, 100) if ratio else (0.005 if name == "tag_size" else 1e-4, 1)
+        if not low <= value < high:
+            remedy = (
+                "it is in tag sizes, such as 0.3" if ratio else f"lengths are in metres, such as {value / 1000 if value >= 1 else 0.03:g}"
+            )
+            raise BadInputError(f"{name.replace('_', ' ')} of {value:g} makes no board: {remedy}")
     if isinstance(board, Charuco) and board.marker_size >= board.square_size:
         raise BadInputError(
             f"a marker of {board.marker_size:g} m does not fit into a square of {board.square_size:g} m: give a smaller --marker"

@@ -83,6 +83,7 @@ def camera_lines(summary: Summary) -> list[str]:
             text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
             text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
         lines.append(one_line(text))
+        lines += [f"  {text}" for text in _pixel_sigma(summary, name)]
         lines += [f"  held-out error by model, outliers included: {one_line(scores)}" for scores in _model_scores(summary, name)]
     return lines
 
@@ -95,6 +96,22 @@ def _seen(summary: Summary, camera: str) -> str:
         if isinstance(counts, Mapping) and counts.get("images"):
             return f"; the board is in {counts.get('with_board')} of {counts['images']} images"
     return ""
+
+
+def _pixel_sigma(summary: Summary, camera: str) -> list[str]:
+    """Return how well a point's pixel is known, where boards were seen and at the worst place of the image."""
+    for result in summary.results:
+        maps = result.facts.get("projection_sigma")
+        found = maps.get(camera) if isinstance(maps, Mapping) else None
+        if isinstance(found, Mapping) and isinstance(found.get("sigma_px"), list) and isinstance(found.get("seen"), list):
+            pairs = [(s, seen) for s, seen in zip(found["sigma_px"], found["seen"], strict=False) if isinstance(s, float)]
+            inside = [s for s, seen in pairs if seen]
+            if inside:
+                worst = max(s for s, _ in pairs)
+                return [
+                    f"a far point's pixel is known to {max(inside):.2g} px where boards were seen, to {worst:.2g} px at the worst place"
+                ]
+    return []
 
 
 def _model_scores(summary: Summary, camera: str) -> list[str]:

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -37,8 +37,9 @@ def alone(model: str) -> Case:
 
 
 def moving() -> Case:
-    """30 s at 10 Hz before the board: neighbouring views are alike, and blocks of seconds hold many of them."""
-    scenario = SCENARIOS["aprilgrid"]
+    """30 s at 4 Hz before the board: neighbouring views are alike, and blocks of seconds hold several of them."""
+    camera = replace(SCENARIOS["aprilgrid"].cameras[0], rate_hz=4.0)
+    scenario = replace(SCENARIOS["aprilgrid"], cameras=(camera,))
     return Case(scenario.cameras, lambda seed: [simulate_views(simulate_session(scenario, seed))[0]])
 
 

@@ -8,7 +8,7 @@ from lens_samples import GRID, LENSES, T_CAM1_CAM0, board_views, rig_views, scra
 
 from calibkit.data.observations import BoardViews
 from calibkit.errors import NotConvergedError
-from calibkit.estimation import lens_fit
+from calibkit.estimation import intrinsics, lens_fit
 from calibkit.estimation.camera_rig_seed import components, match_instants
 from calibkit.estimation.intrinsics import CameraRequest, calibrate_cameras
 from calibkit.estimation.lens_fit import LensFit, fit_lenses
@@ -30,10 +30,9 @@ def fit_rig(views: list[BoardViews], models: list[str]) -> LensFit:
     return fit_lenses(views, models, match_instants(views))
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("model", CAMERAS)
-def test_perfect_corners_give_the_lens_back_from_no_guess(model, seed):
-    found = fit(board_views(model, 15, seed, noise_px=0.0), model)
+def test_perfect_corners_give_the_lens_back_from_no_guess(model):
+    found = fit(board_views(model, 15, 0, noise_px=0.0), model)
     assert found.converged
     assert not found.dropped
     assert np.array_equal(found.kept[0], found.observed[0])
@@ -92,7 +91,7 @@ ROBUST_SEEDS = 2
 def test_gross_outliers_and_bad_frames_are_found_and_cost_little(model):
     clean, with_outliers, with_bad_frames = [], [], []
     for seed in range(ROBUST_SEEDS):
-        views = board_views(model, 30, seed, board=SMALL)
+        views = board_views(model, 20, seed, board=SMALL)
         first = fit(views, model)
         sigma, truth = np.sqrt(np.diag(lens_covariance(first).plain))[:4], LENSES[model].params[:4]
         clean.append((first.state.lenses[0][:4] - truth) / sigma)
@@ -207,8 +206,9 @@ def test_two_cameras_without_noise_give_the_transform_from_cam0_to_cam1():
         np.testing.assert_allclose(lens, camera.params, rtol=1e-6)
 
 
-def test_the_result_names_both_directions():
+def test_the_result_names_both_directions(monkeypatch):
     views = two(10, noise_px=0.0)
+    monkeypatch.setattr(intrinsics, "CAMERAS", {model: CAMERAS[model] for model in MODELS})  # no other models to compare
     result = calibrate_cameras([CameraRequest(v, model) for v, model in zip(views, MODELS, strict=False)])
     entry = result.rig.transforms["T_cam1_cam0"]
     assert list(result.rig.transforms) == ["T_cam1_cam0"]
@@ -242,7 +242,8 @@ def test_the_order_of_the_cameras_does_not_matter():
     np.testing.assert_allclose(second.state.lenses[1], first.state.lenses[0], rtol=1e-5)
 
 
-def test_cameras_that_never_look_together_are_calibrated_apart_and_said_to_be_so():
+def test_cameras_that_never_look_together_are_calibrated_apart_and_said_to_be_so(monkeypatch):
+    monkeypatch.setattr(intrinsics, "CAMERAS", {model: CAMERAS[model] for model in MODELS})
     cam0, cam1 = two(30)
     views = [cam0.select(cam0.t_ns < 15.5e9), cam1.select(cam1.t_ns > 15.5e9)]
     assert components(match_instants(views)) == [[0], [1]]

@@ -142,7 +142,7 @@ def test_a_topic_is_chosen_or_the_candidates_are_named(tmp_path: Path) -> None:
         recording.choose("image", "/middle")
     with pytest.raises(BadInputError, match="it has no imu topic"):
         recording.choose("imu")
-    with pytest.raises(BadInputError, match="/left is sensor_msgs/msg/Image, not a imu topic"):
+    with pytest.raises(BadInputError, match="/left is sensor_msgs/msg/Image, not an imu topic"):
         recording.imu("/left")
 
 

@@ -13,6 +13,7 @@ from calibkit.models.cameras import CameraModel
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _SAME_ORIENTATION = np.deg2rad(5.0)
+_OUTERMOST = 99.0  # percentile of an effect over the corners: at the outermost, but for a stray one
 _GRID = (24, 16)
 _BIAS_INSTANTS = 60
 _BIAS_PATCHES = (4, 3)
@@ -70,15 +71,47 @@ def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:
     """
     scales = np.empty(problem.border_size)
     for views, lens, where in zip(problem.cameras, lenses, problem.lens_slices, strict=True):
-        rays, valid = views.model.unproject(views.uv[views.weight > 0][:: max(1, int(np.sum(views.weight > 0)) // 5000)], lens)
-        J = views.model.project(rays[valid], lens, jacobians=True).J_params
-        assert J is not None
-        effect = np.percentile(np.linalg.norm(J, axis=-2), 99, axis=0) if valid.any() else np.ones(len(lens))
+        J = _corner_jacobians(views, lens)
+        effect = np.percentile(np.linalg.norm(J, axis=-2), _OUTERMOST, axis=0) if len(J) else np.ones(len(lens))
         effect[:4] = 1.0
         scales[where] = SCALES["px"] / np.maximum(effect, 1e-9)
     for c in range(1, len(problem.cameras)):
         scales[problem.rig_slice(c)] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
     return scales
+
+
+def _corner_jacobians(views: CameraViews, lens: Array) -> Array:
+    """Return duv/dlens (k, 2, p) at a few thousand of the corners."""
+    uv = views.uv[views.weight > 0]
+    rays, valid = views.model.unproject(uv[:: max(1, len(uv) // 5000)], lens)
+    J = views.model.project(rays[valid], lens, jacobians=True).J_params
+    assert J is not None
+    return J
+
+
+@dataclass(frozen=True)
+class PixelEffect:
+    """What a lens's uncertainty moves where corners were: the 99th percentile over the corners, px."""
+
+    parameters: Array  # (p,) by one sigma of each parameter, the others following it as they are correlated
+    weakest: Array  # (p,) the motion of one sigma that moves the corners most
+    weakest_px: float
+
+
+def pixel_effect(views: CameraViews, lens: Array, cov_lens: Array) -> PixelEffect:
+    """Return how far one sigma moves pixels: J cov[:, i] / sigma_i by parameter, J F w for the motion that moves them most.
+
+    Coefficients that make up for each other are each uncertain by far more than any pixel is; what counts is the pixel. F F^T = cov, w is
+    the top eigenvector of the mean of (J F)^T J F.
+    """
+    J = _corner_jacobians(views, lens)
+    sigma = np.sqrt(np.diag(cov_lens))
+    values, vectors = np.linalg.eigh(cov_lens / sigma[:, None] / sigma)
+    F = sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0))
+    moved = J @ F
+    motion = F @ np.linalg.eigh(np.mean(np.swapaxes(moved, 1, 2) @ moved, axis=0))[1][:, -1]
+    by_parameter = np.percentile(np.linalg.norm(J @ (cov_lens / sigma), axis=-2), _OUTERMOST, axis=0)
+    return PixelEffect(by_parameter, motion, float(np.percentile(np.linalg.norm(J @ motion, axis=-1), _OUTERMOST)))
 
 
 @dataclass(frozen=True)

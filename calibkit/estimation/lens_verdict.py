@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.estimation.lens_fit import LensFit, instant_times
-from calibkit.estimation.lens_trust import ProjectionSigma, border_scales, orientations, projection_sigma
+from calibkit.estimation.lens_trust import PixelEffect, ProjectionSigma, border_scales, orientations, pixel_effect, projection_sigma
 from calibkit.estimation.model_choice import ModelScore
 from calibkit.estimation.view_advice import best_view, region_of
 from calibkit.geometry.so3 import Array
-from calibkit.solver.trust import Covariance, directions, grade
+from calibkit.solver.trust import WEAK, Covariance, grade
 
 MIN_LOOKS = 3  # orientations, and seconds: two numbers of fx fy cx cy a look, and one look to check them
 _WORSE_MODEL, _WRONG_MODEL = 1.1, 2.0  # held-out error over the best model's
@@ -35,19 +35,22 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     where, views = fit.problem.lens_slices[c], fit.problem.cameras[c]
     camera, lens = fit.views[c].camera, fit.state.lenses[c]
     cov = covariance.corrected[where, where]
-    scales = border_scales(fit.problem, fit.state.lenses)[where]
     projection = projection_sigma(views, lens, cov)
     reasons = [*_model_reasons(camera, views.model.name, scores), *_frame_reasons(fit, c)]
     hopeless = _no_model_fits(camera, scores)
     too_few = _too_few_looks(fit, c)
     if too_few:
         return LensJudgement((Status.NOT_OBSERVABLE,) * len(lens), (Reason(Verdict.FAIL, f"{camera}: {too_few}"), *reasons), projection)
-    weakest = directions(cov, scales)[0]
-    known = np.maximum(np.sqrt(np.diag(cov)) / scales, np.where(_involved(weakest.vector), weakest.sigma, 0.0))
-    statuses = tuple(Status(grade(float(ratio))) for ratio in known)
+    effect = pixel_effect(views, lens, cov)
+    moved = _involved(effect, cov)
+    known = np.maximum(effect.parameters, np.where(moved, effect.weakest_px, 0.0))
+    # A coefficient that others make up for to such an extent says nothing by itself, well as the pixels may be known.
+    alone = np.sqrt(np.diag(cov)) / border_scales(fit.problem, fit.state.lenses)[where]
+    known = np.where(alone > WEAK, np.maximum(known, WEAK), known)
+    statuses = tuple(Status(grade(float(px))) for px in known)
     if hopeless:  # more views of a board that is not what the target says would not help
         return LensJudgement(statuses, (*hopeless, *reasons), projection)
-    reasons += _direction_reasons(fit, c, covariance, cov, scales)
+    reasons += _direction_reasons(fit, c, covariance.variance_factor, cov, effect)
     reasons += _extrapolation_reasons(camera, views.image_size, projection)
     return LensJudgement(statuses, tuple(reasons), projection)
 
@@ -95,10 +98,10 @@ def _no_model_fits(camera: str, scores: Sequence[ModelScore]) -> list[Reason]:
     return [Reason(Verdict.FAIL, f"{camera}: {text}: {causes}")]
 
 
-def _involved(direction: Array) -> NDArray[np.bool_]:
-    """Return which parameters a weak direction moves."""
-    share = np.abs(direction)
-    moved: NDArray[np.bool_] = share > 0.35 * share.max()
+def _involved(effect: PixelEffect, cov: Array) -> NDArray[np.bool_]:
+    """Return which parameters the weakest motion moves by much of their sigma."""
+    share = np.abs(effect.weakest) / np.sqrt(np.diag(cov))
+    moved: NDArray[np.bool_] = share > 0.7 * share.max()
     return moved
 
 
@@ -112,20 +115,18 @@ def _frame_reasons(fit: LensFit, c: int) -> list[Reason]:
     return [Reason(Verdict.CHECK, f"{camera}: {len(bad)} of {total} views were given up ({named})")]
 
 
-def _direction_reasons(fit: LensFit, c: int, covariance: Covariance, cov: Array, scales: Array) -> list[Reason]:
-    """Name the weakest direction of the lens and the view that would help it most."""
-    weakest = directions(cov, scales)[0]
-    if weakest.grade == "determined":
+def _direction_reasons(fit: LensFit, c: int, variance_factor: float, cov: Array, effect: PixelEffect) -> list[Reason]:
+    """Name what the lens's weakest motion moves, and the view that would help it most."""
+    known = grade(effect.weakest_px)
+    if known == "determined":
         return []
-    names = fit.problem.cameras[c].model.parameter_names
-    moved = _involved(weakest.vector)
-    involved = ", ".join(names[i] for i in np.argsort(-np.abs(weakest.vector)) if moved[i])
-    # A direction of the scaled lens, as a row vector on the lens itself.
-    advice = best_view(fit, c, cov, weakest.vector / scales, covariance.variance_factor)
+    names = np.array(fit.problem.cameras[c].model.parameter_names)[_involved(effect, cov)]
+    # How far the lens has gone along that motion, as a row vector on the lens.
+    advice = best_view(fit, c, cov, np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ effect.weakest, variance_factor)
     remedy = f"; add views with {advice.text} (ten of them: {advice.sigma_ratio:.0%} of today's sigma)" if advice else ""
-    verdict = Verdict.CHECK if weakest.grade == "weak" else Verdict.FAIL
-    together = "together are" if moved.sum() > 1 else "is"
-    text = f"{involved} {together} {weakest.grade}: known to {weakest.sigma:.1f} px at the outermost corners{remedy}"
+    verdict = Verdict.CHECK if known == "weak" else Verdict.FAIL
+    together = "together are" if len(names) > 1 else "is"
+    text = f"{', '.join(names)} {together} {known}: pixels at the outermost corners are known to {effect.weakest_px:.1f} px{remedy}"
     return [Reason(verdict, f"{fit.views[c].camera}: {text}")]
 
 

@@ -24,6 +24,9 @@ FISHEYE = SimCamera(CAMERAS["pinhole-equi"], np.array([383.5, 384.5, 638.6, 477.
 CLEAN = RenderStyle(lighting=0, blur_px=0.5, noise=0)
 APRILGRID = AprilGrid(6, 6, 0.088, 0.3)
 
+# Older ArUco misses tags and sets raw corners half a pixel off; its figures follow what 4.10 was found to do.
+NEW_ARUCO = tuple(int(part) for part in cv2.__version__.split(".")[:2]) >= (4, 14)
+
 
 def upright(board: Board, distance: float) -> Array:
     return place_board(board, np.eye(3), np.array([0, 0, distance]))
@@ -102,10 +105,10 @@ def test_tags_lie_in_the_grid_as_kalibr_prints_them() -> None:
     tags = marker_axes(Renderer(RADTAN, APRILGRID).render(T, np.random.default_rng(0)))
     centres = (APRILGRID.points.reshape(-1, 4, 3)).mean(axis=1)
     expected = RADTAN.model.project(se3.transform(T, centres), RADTAN.params).uv
-    assert len(tags) >= 32  # 36 from OpenCV 4.14 on
+    assert len(tags) >= (36 if NEW_ARUCO else 32)
     assert all(np.linalg.norm(c.mean(axis=0) - expected[t]) < 3 for t, c in tags.items())
     assert expected[0, 1] > expected[35, 1]  # seen upright, tag 0 is at the lower left
-    assert half_turned(tags) >= 20
+    assert half_turned(tags) >= (30 if NEW_ARUCO else 20)
 
 
 def test_real_prints_turn_their_tags_the_same_way(data_dir: Path) -> None:
@@ -124,7 +127,7 @@ def test_opencv_finds_its_own_boards() -> None:
     corners, ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(Renderer(RADTAN, charuco).render(T, rng))
     uv = RADTAN.model.project(se3.transform(T, charuco.points), RADTAN.params).uv
     assert len(ids) == 28
-    assert np.abs(corners.reshape(-1, 2) - uv[ids.ravel()]).max() < 0.7  # before 4.14 half a pixel off
+    assert np.abs(corners.reshape(-1, 2) - uv[ids.ravel()]).max() < (0.5 if NEW_ARUCO else 0.7)
 
 
 def test_style_is_what_it_says() -> None:

@@ -13,22 +13,28 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import platformdirs
 
-from calibkit.detection.boards import VERSION
 from calibkit.detection.found import Detection, Tags
 from calibkit.models.board import Board
 from calibkit.opencv import cv2
+from calibkit.version import __version__
+
+if TYPE_CHECKING:
+    from importlib.abc import Traversable
 
 T = TypeVar("T")
 Entry = tuple[tuple[int, int], Detection]  # image width and height, what was found
 
 _HEADER = struct.Struct("<4s6I")
 _MAGIC = b"ckc2"
+_ANSWERING = ("detection", "models/board.py", "io/images.py")  # the code between an image as stored and its corners
 _MAX_BYTES = 512 * 2**20
 _ROW = np.dtype([("corner", "<i4"), ("u", "<f8"), ("v", "<f8"), ("sigma", "<f8")])
 
@@ -38,8 +44,30 @@ def folder() -> Path:
     return Path(os.environ.get("CALIBKIT_CACHE_DIR") or platformdirs.user_cache_dir("calibkit"))
 
 
+def code_hash(package: "Traversable") -> str:
+    """Return a hash of the source that finds corners; calibkit's version where it is installed without sources."""
+    try:
+        modules = [module for name in _ANSWERING for module in _modules(package / name)]
+        digests = [hashlib.sha256(module.read_bytes()).digest() for module in modules]
+    except OSError:
+        return __version__
+    return hashlib.sha256(b"".join(digests)).hexdigest()
+
+
+def _modules(place: "Traversable") -> list["Traversable"]:
+    if not place.is_dir():
+        return [place]
+    inside = sorted(place.iterdir(), key=lambda entry: entry.name)
+    return [module for entry in inside if entry.is_dir() or entry.name.endswith(".py") for module in _modules(entry)]
+
+
+@cache
+def _detector() -> bytes:
+    return f"{code_hash(files('calibkit'))}\0{cv2.__version__}".encode()
+
+
 class CornerCache:
-    """Detections by content: the image's bytes, the board, the detector's and OpenCV's version."""
+    """Detections by content: the image's bytes, the board, the detector's source and OpenCV's version."""
 
     def __init__(self, path: Path | None = None, max_bytes: int = _MAX_BYTES) -> None:
         self._path = path or folder() / "corners.sqlite3"
@@ -50,8 +78,7 @@ class CornerCache:
 
     def key(self, payload: bytes, board: Board) -> bytes:
         """Return the key of an image as stored, for this board and detector."""
-        text = f"{board.key()}\0{VERSION}\0{cv2.__version__}\0".encode()
-        return hashlib.sha256(text + hashlib.sha256(payload).digest()).digest()
+        return hashlib.sha256(b"\0".join((board.key().encode(), _detector(), hashlib.sha256(payload).digest()))).digest()
 
     def get(self, key: bytes, board: Board) -> Entry | None:
         """Return what is known under the key, None where nothing valid is."""

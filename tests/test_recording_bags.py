@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 from recording_helper import FORMATS, Make, store, write
@@ -17,7 +18,7 @@ from calibkit.errors import BadInputError
 from calibkit.io.recording import open_recording
 from calibkit.io.ros_bag import restamp
 from calibkit.io.ros_messages import IMU, KINDS, decode_imu, header_ns
-from calibkit.io.unpack import zstd
+from calibkit.io.unpack import unpack, zstd
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 T0 = 1_700_000_000_000_000_000
@@ -246,7 +247,7 @@ def _flip(raw: bytes, rng: np.random.Generator, n: int) -> list[bytearray]:
     return copies
 
 
-@pytest.mark.parametrize("form", ["ros1", "mcap", "db3"])
+@pytest.mark.parametrize("form", ["ros1", "ros1-lz4", "mcap", "db3"])
 def test_what_a_cut_file_holds_is_saved_and_counted(tmp_path: Path, form: str) -> None:
     path = write(tmp_path, form, _messages(form, 4000))
     file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
@@ -260,6 +261,24 @@ def test_what_a_cut_file_holds_is_saved_and_counted(tmp_path: Path, form: str) -
     np.testing.assert_array_equal(saved.gyro, whole.gyro[np.searchsorted(whole.t_ns, saved.t_ns)])
     count = sum(topic.count for topic in recording.topics)
     assert any(f"{count} messages saved" in warning for warning in recording.warnings)
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_of_a_cut_chunk_its_whole_blocks_are_saved(compression: str) -> None:
+    data = np.random.default_rng(0).bytes(3_000_000)
+    packed = {"bz2": bz2.compress, "lz4": lz4.frame.compress}[compression](data)
+    saved = unpack(compression, packed[: len(packed) // 2], len(data), partial=True)
+    assert 0.25 * len(data) < len(saved) < 0.55 * len(data)
+    assert data.startswith(saved)
+
+
+@pytest.mark.parametrize("form", ["ros1-bz2", "ros1-lz4"])
+def test_a_bag_cut_in_its_first_block_says_why_nothing_is_saved(tmp_path: Path, form: str) -> None:
+    path = write(tmp_path, form, _messages(form))
+    path.write_bytes(path.read_bytes()[:4400])
+    told = rf"nothing can be saved of this bag \(it was not closed.*chunk at byte 4109 is damaged \({form[5:]} data ends too soon"
+    with pytest.raises(BadInputError, match=told):
+        open_recording([path])
 
 
 def _ros1_record(header: dict[bytes, bytes], data: bytes) -> bytes:

@@ -29,7 +29,7 @@ class UnpackError(Exception):
 
 
 def unpack(compression: str, data: bytes, limit: int, partial: bool = False) -> bytes:
-    """Return `data` unpacked, at most `limit` bytes; `partial` accepts packed data that was cut short."""
+    """Return `data` unpacked, at most `limit` bytes; `partial` accepts packed data that was cut short, as far as its blocks are whole."""
     if compression in ("", "none"):
         return data
     if compression not in _DECOMPRESSORS:
@@ -41,7 +41,7 @@ def unpack(compression: str, data: bytes, limit: int, partial: bool = False) -> 
         raise UnpackError(f"{compression} data is damaged ({error})") from error
     if len(out) > limit:
         raise UnpackError(f"{compression} data unpacks to more than the {limit} bytes declared")
-    if not decompressor.eof and not partial:
+    if not decompressor.eof and not (partial and out):
         raise UnpackError(f"{compression} data ends too soon")
     return out
 

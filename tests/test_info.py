@@ -13,6 +13,8 @@ from calibkit.errors import BadInputError
 from calibkit.estimation import doctor
 from calibkit.geometry import so3
 from calibkit.io.recording import open_recording
+from calibkit.io.ros1_bag import Ros1Bag
+from calibkit.opencv import cv2
 from calibkit.stages.info import Info, as_json, info
 
 T0 = 1_700_000_000_000_000_000
@@ -182,6 +184,32 @@ def test_a_healthy_bag_has_no_problems(tmp_path: Path) -> None:
     assert (camera.topic.kind, camera.held, camera.image.width, camera.image.height, camera.image.sampled) == ("image", 120, 60, 40, 20)
     assert (imu.held, imu.rate_hz) == (2400, pytest.approx(200))
     assert "allan" in imu.topic.usable_for
+
+
+def test_a_recording_is_read_once_whatever_its_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = _bag(tmp_path)
+    expected = open_recording([bag]).imu("/imu0")
+    passes: list[object] = []
+    read = Ros1Bag.messages
+    monkeypatch.setattr(Ros1Bag, "messages", lambda self, topics: passes.append(topics) or read(self, topics))
+    assert info([bag]).topics[0].image is not None
+    assert len(passes) == 1
+    found = open_recording([bag]).survey()["/imu0"].imu
+    assert found is not None
+    for name in ("t_ns", "gyro", "accel"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_of_a_folder_only_the_images_judged_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(100):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), _board(0))
+    files: list[Path] = []
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda self: files.append(self) or read(self))
+    (topic,) = info([tmp_path]).topics
+    assert topic.image is not None
+    assert (topic.held, topic.image.sampled, len(files)) == (100, 20, 20)
+    assert files[1].name == "5.png"
 
 
 def test_faults_that_other_tools_take_for_a_calibration_are_named(tmp_path: Path) -> None:

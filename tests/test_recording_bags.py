@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calibkit.errors import BadInputError
 from calibkit.io.recording import open_recording
-from calibkit.io.ros_bag import restamp
 from calibkit.io.ros_messages import IMU, KINDS, decode_imu, header_ns
+from calibkit.io.topic_pass import restamp
 from calibkit.io.unpack import unpack, zstd
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"

@@ -1,7 +1,7 @@
 """IMU, pose and corner streams in CSV (or TUM's blank-separated) files, recognised by their header or their shape."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -14,8 +14,9 @@ from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.folder import stamp_ns
-from calibkit.io.ros_bag import plausible, unit_poses
-from calibkit.io.source import CornerRows, Source, Stamps, TopicInfo
+from calibkit.io.ros_bag import unit_poses
+from calibkit.io.source import CornerRows, Look, Source, Stamps, TopicInfo
+from calibkit.io.topic_pass import plausible
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -184,11 +185,11 @@ def csv_source(path: Path, topic: str) -> Source:
     source.imu.update({topic: partial(_imu, path, source.name, source.warn)} if kind == "imu" else {})
     source.poses.update({topic: partial(_poses, path, source.name, topic, source.warn)} if kind == "pose" else {})
 
-    def survey(progress: Progress) -> dict[str, Stamps]:
+    def survey(progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
         t_ns = _table(path, source.name, source.warn).times()
         if kind == "corners":
             t_ns = t_ns[np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))]  # one stamp a frame, not one a corner
-        return {topic: Stamps(None, t_ns)}
+        return {topic: Stamps(None, t_ns, _imu(path, source.name, source.warn) if kind == "imu" else None)}
 
     source.survey = survey
     return source

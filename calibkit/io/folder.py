@@ -1,7 +1,7 @@
 """Folders of images and EuRoC/ASL folders (sensor/data.csv with sensor/data/ beside it) as a `Source`."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from calibkit.data.observations import ImageFrame
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import images
-from calibkit.io.source import Source, Stamps, TopicInfo, seconds_text
+from calibkit.io.source import Look, Source, Stamps, TopicInfo, seconds_text
 
 _MAX_FILE = 2**30  # bytes of one image
 _NUMBER = re.compile(r"[0-9]{1,20}(\.[0-9]{1,9})?")
@@ -88,7 +88,11 @@ def _add_images(source: Source, topic: str, kind: str, frames: list[tuple[int, P
     source.topics.append(TopicInfo(topic, kind, "image", len(frames)))
     source.images[topic] = partial(_frames, source.name, frames)
 
-    def survey(progress: Progress) -> dict[str, Stamps]:
+    def survey(progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
+        if look := looks.get(topic):
+            chosen = frames[:: look.every]
+            for frame in progress(_frames(source.name, chosen), f"images of {topic}", len(chosen)):
+                look.show(frame)
         return {topic: Stamps(None, times)}
 
     source.survey = survey

@@ -4,7 +4,7 @@ Nothing is read before it is asked for; what had to be mended is told in `warnin
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -17,7 +17,7 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.io import ros_messages, tf_tree
 from calibkit.io.board_corners import board_views
 from calibkit.io.open_source import open_sources
-from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo
+from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo
 from calibkit.models.board import Board
 
 T = TypeVar("T")
@@ -80,8 +80,7 @@ class Recording:
 
     def imu(self, topic: str) -> ImuSamples:
         """Return all samples of an IMU."""
-        parts = [read() for read in self._readers("imu", topic, (source.imu for source in self._sources))]
-        return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "gyro", "accel")))
+        return _join_imu([read() for read in self._readers("imu", topic, (source.imu for source in self._sources))])
 
     def poses(self, topic: str) -> PoseSamples:
         """Return all poses of a topic."""
@@ -106,11 +105,11 @@ class Recording:
         rows = [read() for read in self._readers("corners", chosen, (source.corners for source in self._sources))]
         return board_views(rows, board, image_size)
 
-    def survey(self, progress: Progress = silent) -> dict[str, Stamps]:
-        """Return the times of every topic's messages, read in one pass."""
+    def survey(self, progress: Progress = silent, looks: Mapping[str, Look] | None = None) -> dict[str, Stamps]:
+        """Return the times of every topic's messages and the samples of IMUs, read in one pass; show images of some topics by the way."""
         parts: dict[str, list[Stamps]] = {}
         for source in self._sources:
-            for name, stamps in (source.survey(progress) if source.survey else {}).items():
+            for name, stamps in (source.survey(progress, looks or {}) if source.survey else {}).items():
                 parts.setdefault(name, []).append(stamps)
         return {name: _join_stamps(found) for name, found in parts.items()}
 
@@ -130,9 +129,18 @@ def _join(parts: list[PoseSamples]) -> PoseSamples:
     return PoseSamples(t_ns, q, p, parts[0].parent, parts[0].child)
 
 
+def _join_imu(parts: list[ImuSamples]) -> ImuSamples:
+    return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "gyro", "accel")))
+
+
 def _join_stamps(parts: list[Stamps]) -> Stamps:
     headers = [part.header_ns for part in parts if part.header_ns is not None]
-    return Stamps(np.concatenate(headers) if len(headers) == len(parts) else None, np.concatenate([part.record_ns for part in parts]))
+    samples = [part.imu for part in parts if part.imu is not None]
+    return Stamps(
+        np.concatenate(headers) if len(headers) == len(parts) else None,
+        np.concatenate([part.record_ns for part in parts]),
+        _join_imu(samples) if samples else None,
+    )
 
 
 def _digest(files: list[Path]) -> str:

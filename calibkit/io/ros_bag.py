@@ -1,51 +1,25 @@
 """ROS 1 and ROS 2 bags as a `Source`: files opened by what they are, messages decoded into observations when asked."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
-from calibkit.data.progress import Progress
+from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import images, ros_messages
 from calibkit.io.container import Container, Message
-from calibkit.io.source import CameraInfo, Edge, Source, Stamps, TopicInfo, seconds_text
+from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo, seconds_text
+from calibkit.io.topic_pass import TopicPass, plausible, restamp
 from calibkit.io.unpack import UnpackError, unpack_message
 
-T = TypeVar("T")
 Array = NDArray[np.float64]
-_ABSURD = 1e9  # in SI units
-_BATCH = 4096  # Imu messages decoded at once
 _END_OF_TIME = 2**62  # ns, in 2116: later record times are damage
-_PATIENCE = 10  # messages without a stamp to hold back until one has a stamp
-
-
-def restamp(messages: Iterable[tuple[int, int, T]], zeros: list[int]) -> Iterator[tuple[int, T]]:
-    """Yield (time, item) from (header, record, item): header times; where they are zero, record times on the header's clock.
-
-    A zero stamp takes its record time plus the latest known difference of the two clocks (0 when no header has a time).
-    The record times of zero stamps are appended to `zeros`.
-    """
-    difference: int | None = None
-    held: list[tuple[int, T]] = []
-    for header, record, item in messages:
-        if header == 0:
-            zeros.append(record)
-            held.append((record, item))
-        else:
-            difference = header - record
-        if held and (difference is not None or len(held) > _PATIENCE):
-            yield from ((time + (difference or 0), waiting) for time, waiting in held)
-            held.clear()
-        if header != 0:
-            yield header, item
-    yield from ((time + (difference or 0), waiting) for time, waiting in held)
 
 
 class _Bag:
@@ -83,8 +57,7 @@ class _Bag:
         zeros: list[int] = []
         triples = ((ros_messages.header_ns(m.payload, m.channel.encoding), m.record_ns, m) for m in self.messages([topic]))
         yield from restamp(triples, zeros)
-        if zeros:
-            self.source.warn(f"{topic}: {len(zeros)} header stamps are zero: record times are used for them")
+        self._warn_of_zeros(topic, len(zeros))
 
     def decoded(self, messages: Iterable[tuple[int, Message]], topic: str) -> Iterator[tuple[int, Any]]:
         """Yield the messages that can be decoded; count the others."""
@@ -100,25 +73,17 @@ class _Bag:
             self.source.warn(f"{topic}: {broken} damaged messages are left out")
 
     def images(self, topic: str) -> Iterator[ImageFrame]:
-        for t_ns, message in self.stamped(topic):
-            label = seconds_text(t_ns)
-            where = f"{self.source.name}: {topic} at {label}"
-            yield ImageFrame(t_ns, label, message.payload, partial(decode_image, message, where, self.distro))
+        return (self._frame(t_ns, message) for t_ns, message in self.stamped(topic))
+
+    def _frame(self, t_ns: int, message: Message) -> ImageFrame:
+        label = seconds_text(t_ns)
+        where = f"{self.source.name}: {message.channel.topic} at {label}"
+        return ImageFrame(t_ns, label, message.payload, partial(decode_image, message, where, self.distro))
 
     def imu(self, topic: str) -> ImuSamples:
-        stamped = self.stamped(topic)
-        times, gyros, accels = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
-        lost = 0
-        while batch := list(islice(stamped, _BATCH)):
-            gyro, accel, whole = ros_messages.decode_imu([m.payload for _, m in batch], batch[0][1].channel.encoding)
-            whole &= plausible(gyro) & plausible(accel)
-            lost += int(np.sum(~whole))
-            times.append(np.array([t_ns for t_ns, _ in batch], np.int64)[whole])
-            gyros.append(gyro[whole])
-            accels.append(accel[whole])
-        if lost:
-            self.source.warn(f"{topic}: {lost} samples are damaged or not finite and left out")
-        return ImuSamples(np.concatenate([np.zeros(0, np.int64), *times]), np.concatenate(gyros), np.concatenate(accels))
+        samples = self._pass({topic: "imu"}, silent, {})[topic].imu
+        assert samples is not None, "a pass reads the samples of every IMU"
+        return samples
 
     def poses(self, topic: str) -> PoseSamples:
         rows: list[tuple[int, ros_messages.Pose]] = []
@@ -154,20 +119,31 @@ class _Bag:
                     rows.setdefault(key, []).append((t_ns, pose))
         return {(parent, child): Edge(pose_samples(found, child)[0], static) for (parent, child, static), found in rows.items()}
 
-    def survey(self, progress: Progress) -> dict[str, Stamps]:
-        """Read all times of all topics in one pass."""
+    def survey(self, progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
+        return self._pass({topic.name: topic.kind for topic in self.source.topics}, progress, looks)
+
+    def _pass(self, kinds: Mapping[str, str], progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
+        """Read some topics at once, whatever their kinds."""
         headed = {c for container in self.containers for c in container.counts if ros_messages.starts_with_header(c.type)}
         total = sum(topic.count for topic in self.source.topics)
-        found: dict[str, tuple[list[int], list[int]]] = {topic.name: ([], []) for topic in self.source.topics}
-        for message in progress(self.messages(found.keys()), "reading", total):
-            headers, records = found[message.channel.topic]
-            records.append(message.record_ns)
-            if message.channel in headed:
-                headers.append(ros_messages.header_ns(message.payload, message.channel.encoding))
-        return {
-            name: Stamps(np.array(headers, np.int64) if len(headers) == len(records) else None, np.array(records, np.int64))
-            for name, (headers, records) in found.items()
-        }
+        passes = {name: TopicPass(kind) for name, kind in kinds.items()}
+        for message in progress(self.messages(passes.keys()), "reading", total):
+            name = message.channel.topic
+            if name in looks and len(passes[name]) % looks[name].every == 0:
+                t_ns = ros_messages.header_ns(message.payload, message.channel.encoding) or message.record_ns
+                looks[name].show(self._frame(t_ns, message))
+            passes[name].add(message, message.channel in headed)
+        found = {name: of_topic.stamps() for name, of_topic in passes.items()}
+        for name, of_topic in passes.items():
+            if of_topic.kind in ("image", "imu"):
+                self._warn_of_zeros(name, of_topic.zeros)
+            if of_topic.lost:
+                self.source.warn(f"{name}: {of_topic.lost} samples are damaged or not finite and left out")
+        return found
+
+    def _warn_of_zeros(self, topic: str, zeros: int) -> None:
+        if zeros:
+            self.source.warn(f"{topic}: {zeros} header stamps are zero: record times are used for them")
 
 
 def decode_image(message: Message, where: str, distro: str | None) -> images.Gray:
@@ -190,12 +166,6 @@ def pose_samples(rows: list[tuple[int, ros_messages.Pose]], child: str) -> tuple
     q = np.array([(q.x, q.y, q.z, q.w) for _, (_, q, _, _) in rows], float).reshape(-1, 4)
     frames = [(parent, name) for _, (_, _, parent, name) in rows[:1]] or [("", "")]
     return unit_poses(t_ns, q, p, one_line(frames[0][0], 100), one_line(frames[0][1], 100) or child)
-
-
-def plausible(values: Array) -> NDArray[np.bool_]:
-    """Tell which rows are finite and of a size that any sensor can mean; what damage leaves can be anything."""
-    rows: NDArray[np.bool_] = np.all(np.abs(values) < _ABSURD, axis=1)
-    return rows
 
 
 def unit_poses(t_ns: NDArray[np.int64], q: Array, p: Array, parent: str, child: str) -> tuple[PoseSamples, int]:

@@ -1,6 +1,6 @@
 """What every kind of recording is turned into: topics, and for each kind of topic a way to read it when asked."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,10 +43,19 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class Stamps:
-    """Times of one topic's messages in the order of the file."""
+    """Times of one topic's messages in the order of the file, and what was read with them."""
 
     header_ns: Times | None  # (n,) None: this type has no header
     record_ns: Times  # (n,)
+    imu: ImuSamples | None = None  # of an IMU topic
+
+
+@dataclass(frozen=True)
+class Look:
+    """Some images of a topic, shown while a survey passes them."""
+
+    every: int  # the first of so many images
+    show: Callable[[ImageFrame], None]
 
 
 @dataclass(frozen=True)
@@ -95,7 +104,7 @@ class Source:
     camera_info: dict[str, Callable[[], CameraInfo]] = field(default_factory=dict)
     corners: dict[str, Callable[[], CornerRows]] = field(default_factory=dict)
     edges: Callable[[], dict[tuple[str, str], Edge]] | None = None
-    survey: Callable[[Progress], dict[str, Stamps]] | None = None
+    survey: Callable[[Progress, Mapping[str, Look]], dict[str, Stamps]] | None = None
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, text: str) -> None:

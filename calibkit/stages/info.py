@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.data.observations import ImageFrame, ImuSamples
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation import doctor
 from calibkit.estimation.doctor import Finding
 from calibkit.io.atomic import refuse_unwritable, write_json
 from calibkit.io.recording import Recording, open_recording
-from calibkit.io.source import Stamps, TopicInfo
+from calibkit.io.source import Look, Stamps, TopicInfo
 
 _SAMPLE = 20  # images of a topic that are decoded and judged
 _TIMED = ("image", "imu", "pose", "camera_info", "corners", "cloud")  # kinds whose times matter
@@ -71,8 +72,10 @@ def info(
     if json_path is not None:
         refuse_unwritable(json_path, force)
     recording = open_recording(sources, ros_distro)
-    survey = recording.survey(progress)
-    topics = [_examine(recording, topic, survey[topic.name], progress) for topic in recording.topics]
+    judges = {topic.name: _ImageJudge() for topic in recording.topics if topic.kind == "image"}
+    looks = {topic.name: Look(max(1, topic.count // _SAMPLE), judges[topic.name].see) for topic in recording.topics if topic.name in judges}
+    survey = recording.survey(progress, looks)
+    topics = [_examine(topic, survey[topic.name], judges.get(topic.name)) for topic in recording.topics]
     names = tuple(dict.fromkeys(one_line(path.name or path.resolve().name, 120) for path in sources))
     spans = {t.topic.name: (t.start_ns, t.end_ns) for t in topics if t.topic.kind in _TIMED and t.start_ns and t.end_ns}
     findings = (*doctor.check_clocks(_latencies(recording, survey)), *doctor.check_overlap(spans))
@@ -94,7 +97,7 @@ def _latencies(recording: Recording, survey: dict[str, Stamps]) -> dict[str, flo
     return found
 
 
-def _examine(recording: Recording, topic: TopicInfo, stamps: Stamps, progress: Progress) -> TopicReport:
+def _examine(topic: TopicInfo, stamps: Stamps, images: "_ImageJudge | None") -> TopicReport:
     headers = stamps.header_ns if stamps.header_ns is not None and np.any(stamps.header_ns) else None
     times = stamps.record_ns if headers is None else headers[headers != 0]
     stamped = bool(np.any(times))
@@ -102,27 +105,20 @@ def _examine(recording: Recording, topic: TopicInfo, stamps: Stamps, progress: P
     if topic.kind in _TIMED:
         findings += doctor.check_times(times) if stamped else []
         findings += doctor.check_headers(stamps.header_ns, stamps.record_ns) if stamps.header_ns is not None else []
-    image = None
-    if topic.kind == "imu":
-        findings += _imu_findings(recording, topic)
-    if topic.kind == "image":
-        image, seen = _image_findings(recording, topic, progress)
-        findings += seen
+    findings += _imu_findings(stamps.imu) if stamps.imu is not None and len(stamps.imu.t_ns) else []
+    findings += images.findings() if images else []
     return TopicReport(
         topic=topic,
         held=len(stamps.record_ns) if topic.kind != "corners" else topic.count,
         rate_hz=doctor.rate_hz(times),
         start_ns=int(times.min()) if stamped else None,
         end_ns=int(times.max()) if stamped else None,
-        image=image,
+        image=images.summary() if images else None,
         findings=tuple(findings),
     )
 
 
-def _imu_findings(recording: Recording, topic: TopicInfo) -> list[Finding]:
-    samples = recording.imu(topic.name)
-    if not len(samples.t_ns):
-        return []
+def _imu_findings(samples: ImuSamples) -> list[Finding]:
     return [
         *doctor.check_accel(samples.accel),
         *doctor.check_gyro_unit(samples.t_ns, samples.gyro, samples.accel),
@@ -132,34 +128,42 @@ def _imu_findings(recording: Recording, topic: TopicInfo) -> list[Finding]:
     ]
 
 
-def _image_findings(recording: Recording, topic: TopicInfo, progress: Progress) -> tuple[ImageSummary | None, list[Finding]]:
-    """Decode images spread over the topic and judge them."""
-    every = max(1, topic.count // _SAMPLE)
-    sizes: list[tuple[int, int, int]] = []
-    bright, sharp = [], []
-    broken: list[str] = []
-    for index, frame in enumerate(progress(recording.images(topic.name), f"images of {topic.name}", topic.count)):
-        if index % every:
-            continue
+class _ImageJudge:
+    """Decodes images spread over a topic while they pass, and judges them."""
+
+    def __init__(self) -> None:
+        self._sizes: list[tuple[int, int, int]] = []
+        self._bright: list[float] = []
+        self._sharp: list[float] = []
+        self._broken: list[str] = []
+
+    def see(self, frame: ImageFrame) -> None:
+        """Decode an image and note what it looks like."""
         try:
             gray: NDArray[np.generic] = frame.decode()
         except BadInputError as error:
-            broken.append(str(error))
-            continue
-        sizes.append((gray.shape[1], gray.shape[0], gray.dtype.itemsize * 8))
-        bright.append(doctor.brightness(gray))
-        sharp.append(doctor.sharpness(gray))
-    findings = []
-    if broken:
-        text = f"{len(broken)} of {len(broken) + len(sizes)} sampled images cannot be read; the first: {broken[0]}"
-        findings.append(Finding("unreadable", True, text))
-    if not sizes:
-        return None, findings
-    if len(set(sizes)) > 1:
-        listed = ", ".join(f"{width} x {height} ({bits} bit)" for width, height, bits in sorted(set(sizes))[:4])
-        findings.append(Finding("mixed_sizes", True, f"images differ in size: {listed}"))
-    findings += doctor.check_images(np.array(bright), np.array(sharp))
-    return ImageSummary(*sizes[0], len(sizes), float(np.median(bright)), float(np.median(sharp))), findings
+            self._broken.append(str(error))
+            return
+        self._sizes.append((gray.shape[1], gray.shape[0], gray.dtype.itemsize * 8))
+        self._bright.append(doctor.brightness(gray))
+        self._sharp.append(doctor.sharpness(gray))
+
+    def summary(self) -> ImageSummary | None:
+        """Return what the images look like, None where none can be read."""
+        if not self._sizes:
+            return None
+        return ImageSummary(*self._sizes[0], len(self._sizes), float(np.median(self._bright)), float(np.median(self._sharp)))
+
+    def findings(self) -> list[Finding]:
+        """Return what is wrong with the images."""
+        findings, sizes, broken = [], self._sizes, self._broken
+        if broken:
+            text = f"{len(broken)} of {len(broken) + len(sizes)} sampled images cannot be read; the first: {broken[0]}"
+            findings.append(Finding("unreadable", True, text))
+        if len(set(sizes)) > 1:
+            listed = ", ".join(f"{width} x {height} ({bits} bit)" for width, height, bits in sorted(set(sizes))[:4])
+            findings.append(Finding("mixed_sizes", True, f"images differ in size: {listed}"))
+        return findings + (doctor.check_images(np.array(self._bright), np.array(self._sharp)) if sizes else [])
 
 
 def as_json(result: Info) -> dict[str, object]:

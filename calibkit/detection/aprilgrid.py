@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 _WIDE, _NARROW = 0.16, 0.12  # saddle windows in tag sides, for far and near starts
 _RADIUS = 0.18  # of the final window: inside the border and the small squares, blur included
 _BRIGHT = np.array([-1.0, 1.0, -1.0, 1.0])  # x y is negative where it is white around a tag's corners 0 and 2
+_REACH = 1.0  # tag sides over which neighbours tell how a lens bends
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
@@ -168,14 +169,16 @@ def _finish(image: Smoothed, xy: Array, spacing: float, uv: Array, fitted: Mask)
     corner = np.flatnonzero(np.repeat(fitted.any(1), 4))
     sure, side = fitted.reshape(-1)[corner], np.repeat(_sides(uv), 4)[corner]
     xy, start = xy.reshape(-1, 2)[corner], uv.reshape(-1, 2)[corner]
-    sure = sure & in_line(local_maps(xy, start, step)[1], _OUT_OF_LINE * side)
+    maps, misfit = local_maps(xy, start, _REACH)
+    sure = sure & in_line(misfit, _OUT_OF_LINE * side)
     for _ in range(2):
         if not sure.all() and sure.sum() >= _ENOUGH:
             start[~sure] = predict(xy[sure], start[sure], xy[~sure][:, None], step)[:, 0]
-        maps, _ = local_maps(xy, start, step)
+            maps, _ = local_maps(xy, start, _REACH)
         fit = symmetry(image, start, maps, min(_RADIUS, 0.6 * spacing), _BRIGHT[corner % 4])
-        sure = fit.ok & in_line(local_maps(xy, fit.uv, step)[1], _OUT_OF_LINE * side)
+        start = fit.uv
+        maps, misfit = local_maps(xy, start, _REACH)
+        sure = fit.ok & in_line(misfit, _OUT_OF_LINE * side)
         if sure.all():
             break
-        start = fit.uv
     return Detection(corner[sure].astype(np.int32), fit.uv[sure], fit.sigma_px[sure])

@@ -27,6 +27,7 @@ _MUCH_WORSE = 12.0  # than the frame's typical sigma: something else is in the w
 _MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
 _MIN_WINDOW_PX = 2.0
 _SHRINK = 0.5  # of a saddle window wider than that, each iteration
+_LIGHT_STIFF = np.diag([1e-9, 1.0, 1.0, 3.0, 3.0, 3.0])  # of few corners' light: it is even until they say otherwise
 
 
 def smooth(image: Image) -> Smoothed:
@@ -124,19 +125,21 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     plus, minus = even + odd, even - odd
     start, uv = uv, uv.copy()
     h = np.array([[0.5, 0.0], [0.0, 0.5]])
-    columns = []
+    columns, level = [], np.zeros(len(uv))
     for e in h:
         at = uv[:, None]
-        difference = (
-            sample(image, at + plus + e) - sample(image, at + plus - e) - sample(image, at + minus + e) + sample(image, at + minus - e)
-        )
-        columns.append(difference * _WEIGHT)
+        a, b = sample(image, at + plus + e), sample(image, at + plus - e)
+        c, d = sample(image, at + minus + e), sample(image, at + minus - e)
+        columns.append((a - b - c + d) * _WEIGHT)
+        level += (a + b + c + d).mean(1)
     D = np.stack(columns, axis=-1)
+    slope = _light_slope(uv, level)[..., None]
+    light_plus, light_minus = 1 - (plus @ slope)[..., 0], 1 - (minus @ slope)[..., 0]
     normal = np.swapaxes(D, 1, 2) @ D
     inverse = np.linalg.inv(normal + np.maximum(1e-9, 1e-6 * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(2))
     gain = inverse @ np.swapaxes(D, 1, 2)  # (n, 2, pairs)
     for _ in range(iterations):
-        first, second = sample(image, uv[:, None] + plus), sample(image, uv[:, None] + minus)
+        first, second = sample(image, uv[:, None] + plus) * light_plus, sample(image, uv[:, None] + minus) * light_minus
         odd_part = (first - second) * _WEIGHT
         step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
         uv -= step
@@ -153,6 +156,20 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     if ok.any():
         ok &= sigma < _MUCH_WORSE * np.median(sigma[ok])
     return CornerFit(uv - _drawn_by_blur(maps), sigma, ok)
+
+
+def _light_slope(uv: Array, level: Array) -> Array:
+    """Return the relative slope (n, 2) per px of the light, from the mean gray level (n,) of each corner's window.
+
+    A slope breaks the symmetry: it draws corners by some 0.004 px, along the edges and with the sign of the pattern.
+    """
+    middle, spread = uv.mean(0), uv.std() + 1
+    d = (uv - middle) / spread
+    terms = np.stack([np.ones(len(d)), *d.T, d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2], axis=1)
+    _, x, y, xx, xy, yy = np.linalg.solve(terms.T @ terms + _LIGHT_STIFF, terms.T @ level)
+    rise = np.stack([x + 2 * xx * d[:, 0] + xy * d[:, 1], y + xy * d[:, 0] + 2 * yy * d[:, 1]], axis=-1)
+    out: Array = rise / spread / np.maximum(level, 1e-9)[:, None]
+    return out
 
 
 def _drawn_by_blur(maps: LocalMaps) -> Array:

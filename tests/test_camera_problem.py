@@ -53,8 +53,10 @@ def moved(problem: CameraProblem, state: LensState, index: int, by: float) -> Le
 
 
 def stacked(problem: CameraProblem, state: LensState) -> np.ndarray:
-    """All residuals in sigmas, as one vector."""
-    return np.concatenate([(problem.residuals(state, c).px * camera.weight[..., None]).ravel() for c, camera in enumerate(problem.cameras)])
+    """All residuals in sigmas, the priors' behind the corners', as one vector."""
+    corners = [(problem.residuals(state, c).px * camera.weight[..., None]).ravel() for c, camera in enumerate(problem.cameras)]
+    priors = [camera.model.prior(lens, camera.reach)[0] for camera, lens in zip(problem.cameras, state.lenses, strict=True)]
+    return np.concatenate([*corners, *priors])
 
 
 def dense(problem: CameraProblem, state: LensState) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +107,8 @@ def test_the_blocks_are_those_of_the_dense_jacobian(models):
     n = 6 * INSTANTS
     eliminated = np.linalg.solve(H[:n, :n], np.column_stack([H[:n, n:], g[:n]]))
     schur = np.column_stack([H[n:, n:], g[n:]]) - H[n:, :n] @ eliminated
-    found = np.column_stack([S.sum(axis=0), scores.sum(axis=0)])
+    _, of_prior, score_of_prior = problem.prior(state.lenses)  # no instant's
+    found = np.column_stack([S.sum(axis=0) + of_prior, scores.sum(axis=0) + score_of_prior])
     np.testing.assert_allclose(found, schur, rtol=1e-6, atol=1e-6 * np.abs(schur).max())
 
 
@@ -166,3 +169,24 @@ def test_many_points_in_chunks_and_threads_give_what_few_do():
     assert cost == pytest.approx(times * few_cost, rel=1e-12)
     np.testing.assert_allclose(system.corner, times * few.corner, rtol=1e-10)
     np.testing.assert_allclose(system.core.blocks, np.tile(few.core.blocks, (times, 1, 1)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("lens", ["usual", "near a pole", "beyond a pole"])
+def test_the_rational_lens_prior_has_the_slope_it_states(lens):
+    params = {"usual": (0.52, -0.03, 0.01), "near a pole": (-1.1, 0.2, 0.0), "beyond a pole": (-3.0, 0.5, 0.1)}[lens]
+    model, x = CAMERAS["pinhole-radtan8"], np.array([500.0, 500, 320, 240, 0.3, -0.1, 0, 0, 0.02, *params])
+    r, J = model.prior(x, 0.7)
+    for k in range(len(x)):
+        step = np.zeros(len(x))
+        step[k] = 1e-6
+        numeric = (model.prior(x + step, 0.7)[0] - model.prior(x - step, 0.7)[0]) / 2e-6
+        np.testing.assert_allclose(J[:, k], numeric, rtol=1e-4, atol=1e-6)
+    assert np.all(np.isfinite(r))
+
+
+@pytest.mark.parametrize("model", ["pinhole-radtan", "pinhole-radtan5", "pinhole-equi"])
+def test_lenses_whose_coefficients_cannot_cancel_have_no_prior(model):
+    lens = CAMERAS[model].seed(500.0, (320.0, 240.0))
+    r, J = CAMERAS[model].prior(lens, 0.7)
+    assert r.shape == (0,)
+    assert J.shape == (0, len(lens))

@@ -3,6 +3,7 @@
 r = (uv - project(T_c_cam0 T_cam0_board p_board; lens_c)) / sigma
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -28,6 +29,7 @@ class CameraViews:
     uv: Array  # (f, n, 2) px
     weight: Array  # (f, n) 1/sigma in 1/px, 0: absent
     image_size: tuple[int, int]
+    reach: float = 1.0  # tan^2 of the outermost angle that was seen, for the lens's prior
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class CameraProblem:
     points: Array  # (n, 3) m
     cameras: tuple[CameraViews, ...]
     loss_scale: float = np.inf  # Cauchy's, in sigmas
+    noise: float = 1.0  # what a sigma of the weights really is: a prior counts as much as the corners' information does
     free_lens: bool = True
     free_rig: bool = True
 
@@ -81,6 +84,15 @@ class CameraProblem:
         start = self.lens_slices[-1].stop + 6 * (camera - 1)
         return slice(start, start + 6)
 
+    def prior(self, lenses: Sequence[Array]) -> tuple[float, Array, Array]:
+        """Return what the lenses' priors add to the cost, to the information (p, p) about the border and to its gradient (p,)."""
+        cost, C, g = 0.0, np.zeros((self.border_size, self.border_size)), np.zeros(self.border_size)
+        for camera, lens, where in zip(self.cameras, lenses, self.lens_slices, strict=True):
+            r, J = camera.model.prior(lens, camera.reach)
+            r, J = self.noise * r, self.noise * J
+            cost, C[where, where], g[where] = cost + float(r @ r), J.T @ J, -J.T @ r
+        return cost, C, g
+
     @property
     def border_size(self) -> int:
         return int(self.lens_slices[-1].stop + 6 * (len(self.cameras) - 1))
@@ -94,12 +106,13 @@ class CameraProblem:
 
     def linearize(self, x: LensState) -> tuple[float, Arrowhead]:
         cost, parts = self._normal_parts(x)
-        B, C, g_c = parts.B, parts.C.sum(axis=0), parts.g_c.sum(axis=0)
+        prior_cost, prior_C, prior_g = self.prior(x.lenses)
+        B, C, g_c = parts.B, parts.C.sum(axis=0) + prior_C, parts.g_c.sum(axis=0) + prior_g
         self._fix(B, C, g_c)
-        return cost, Arrowhead(BlockDiagonal(parts.A), B, C, parts.g_x, g_c)
+        return cost + prior_cost, Arrowhead(BlockDiagonal(parts.A), B, C, parts.g_x, g_c)
 
     def information(self, x: LensState) -> tuple[Array, Array]:
-        """Return each instant's information S_i (m, p, p) about the border and its projected score (m, p) at x."""
+        """Return each instant's information S_i (m, p, p) about the border and its projected score (m, p) at x, the prior left out."""
         _, parts = self._normal_parts(x)
         solved = BlockDiagonal(parts.A).solve(np.concatenate([parts.B, parts.g_x[:, :, None]], axis=2))
         nuisance = np.swapaxes(parts.B, 1, 2) @ solved

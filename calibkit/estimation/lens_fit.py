@@ -11,6 +11,7 @@ from calibkit.errors import NotConvergedError
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState, Residuals
 from calibkit.estimation.camera_rig_seed import Instants, board_poses, seed_rig
 from calibkit.estimation.lens_seed import robust_poses_of_views, seed_camera
+from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
 from calibkit.solver.levenberg_marquardt import minimise
@@ -22,6 +23,7 @@ _NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed 
 _BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
 _POSE_LOSS = 8.0  # px: wide enough to bring a pose in from a far start
+_OUTERMOST = 99.9  # percentile of corners, a stray one left out
 _FINEST = 1e-6  # sigmas; perfect data leaves rounding alone, in which nothing stands out
 
 Mask = NDArray[np.bool_]
@@ -183,6 +185,7 @@ def _solve(
         # From px-wide tolerance inwards: the noise is unknown until most corners fit.
         for _ in range(_ROBUST_ROUNDS):
             scale = _noise(problem, state)
+            problem = _weigh_prior(problem, state, scale)
             solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x
             good, grids = _judge_views(used, problem, state, found, dropped)
@@ -191,12 +194,17 @@ def _solve(
             used = [views.select(keep) for views, keep in zip(used, good, strict=True)]
             found = [weight[keep] for weight, keep in zip(found, good, strict=True)]
             rows = [row[keep] for row, keep in zip(rows, good, strict=True)]
-        for _ in range(2):  # corners given up at the robust end may come back at the plain one
+        # Corners given up at the robust end may come back at the plain one; where there is a prior, that it pulls less may bring more.
+        for _ in range(3 if problem.prior(state.lenses)[0] else 2):
             problem = _give_up_corners(problem, state, found)
+            problem = _weigh_prior(problem, state, _noise(problem, state))
             solution = minimise(problem, state)
             state = solution.x
     else:
-        solution = minimise(problem, state)
+        solution = minimise(_weigh_prior(problem, state, 1.0), state)
+        problem = _weigh_prior(problem, solution.x, _noise(problem, solution.x))
+        if problem.prior(solution.x.lenses)[0]:
+            solution = minimise(problem, solution.x)
     names = ", ".join(views.camera for views in used)
     for views, lens in zip(used, solution.x.lenses, strict=True):
         if not np.all(np.isfinite(lens)) or lens[:2].min() <= 0:
@@ -220,6 +228,17 @@ def _noise(problem: CameraProblem, state: LensState) -> float:
     return max(scale_of_norms(np.concatenate(norms)), _FINEST)
 
 
+def _weigh_prior(problem: CameraProblem, state: LensState, noise: float) -> CameraProblem:
+    """Return the problem with what the lenses' priors are asked about: the corners' noise in sigmas, and how far out they lie."""
+    grids = []
+    for c, grid in enumerate(problem.cameras):
+        p = se3.transform(state.T_cam_cam0[c] @ state.T_cam0_board[grid.instant], problem.points)[grid.weight > 0]
+        p = p[p[:, 2] > _FINEST]
+        r2 = (p[:, 0] ** 2 + p[:, 1] ** 2) / p[:, 2] ** 2
+        grids.append(replace(grid, reach=float(np.percentile(r2, _OUTERMOST)) if len(r2) else grid.reach))
+    return replace(problem, cameras=tuple(grids), noise=noise)
+
+
 def _judge_views(
     used: list[BoardViews], problem: CameraProblem, state: LensState, found: list[Array], dropped: list[DroppedView]
 ) -> tuple[list[Mask], list[CameraViews]]:
@@ -229,6 +248,8 @@ def _judge_views(
         z, seen = _normalised(problem, state, c, found[c])
         scale = np.array([scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(z, seen, strict=True)])
         typical = max(float(np.median(scale)), _FINEST)
+        if not np.isfinite(typical):
+            raise NotConvergedError(f"{views.camera}: {grid.model.name} sees most boards nowhere: try another --model")
         good = scale <= _BAD_VIEW * typical
         dropped += [DroppedView(views.camera, views.labels[i], _misfit(scale[i] / typical)) for i in np.flatnonzero(~good)]
         noisier = np.maximum(scale / (_NOISY_VIEW * typical), 1.0)[good]

@@ -132,13 +132,14 @@ def _scan_views(views: CameraViews, points: Array) -> tuple[CameraViews, Array]:
     count = (views.weight > 0).sum(axis=1)
     pick = [int(group[np.argmax(count[group])]) for group in np.array_split(np.arange(len(count)), min(_SCAN_VIEWS, len(count)))]
     weight = (views.weight[pick] > 0).astype(float)  # in px
-    return CameraViews(views.model, np.arange(len(pick)), views.uv[pick], weight, views.image_size), points[some]
+    return replace(views, instant=np.arange(len(pick)), uv=views.uv[pick], weight=weight), points[some]
 
 
 def _refine(views: CameraViews, points: Array, lens: Array, poses: Poses) -> tuple[Array, float]:
     """Return the lens after a short robust solve from this start, and its cost."""
     keep = np.isfinite(poses.error)
-    views = CameraViews(views.model, np.arange(keep.sum()), views.uv[keep], views.weight[keep], views.image_size)
+    reach = float(views.image_size[0] ** 2 + views.image_size[1] ** 2) / 4 / lens[0] ** 2
+    views = replace(views, instant=np.arange(keep.sum()), uv=views.uv[keep], weight=views.weight[keep], reach=reach)
     state = LensState((lens,), np.eye(4)[None], poses.T_cam_board[keep])
     solution = minimise(CameraProblem(points, (views,), loss_scale=_SEED_LOSS), state, max_steps=20, tolerance=1e-3)
     usable = solution.x.lenses[0][:2].min() > 0 and np.isfinite(solution.cost)

@@ -28,7 +28,8 @@ def lens_covariance(fit: LensFit) -> Covariance:
         chi2 += float(np.sum(r.px**2 * camera.weight[..., None] ** 2))
         corners += int(np.sum(camera.weight > 0))
     freedom = max(2 * corners - 6 * len(fit.state.T_cam0_board) - S.shape[-1], 1)
-    found = covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, border_scales(fit.problem, fit.state.lenses))
+    scales = border_scales(fit.problem, fit.state.lenses)
+    found = covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, scales, fit.problem.prior(fit.state.lenses)[1])
     return replace(found, corrected=found.corrected + _bias_covariance(fit))
 
 
@@ -47,7 +48,7 @@ def _bias_covariance(fit: LensFit) -> Array:
     some[np.linspace(0, m - 1, min(m, _BIAS_INSTANTS)).astype(int)] = True
     problem, state = part_of(fit, [some[camera.instant] for camera in fit.problem.cameras])
     S, _ = problem.information(state)
-    inverse = np.linalg.pinv(S.sum(axis=0), rcond=1e-14, hermitian=True)
+    inverse = np.linalg.pinv(S.sum(axis=0) + problem.prior(state.lenses)[1] * np.mean(some), rcond=1e-14, hermitian=True)
     for c, (views, camera) in enumerate(zip(fit.views, problem.cameras, strict=True)):
         predicted = camera.uv - problem.residuals(state, c).px
         patch = np.clip(predicted / camera.image_size * _BIAS_PATCHES, 0, np.array(_BIAS_PATCHES) - 1).astype(int)

@@ -60,26 +60,30 @@ def _inverse_root(S: Array, scales: Array) -> Array:
     return root
 
 
-def covariance(S_blocks: Array, scores: Array, variance_factor: float, scales: Array) -> Covariance:
+def covariance(S_blocks: Array, scores: Array, variance_factor: float, scales: Array, prior: Array | None = None) -> Covariance:
     """Return the sandwich covariance from each block's information (b, p, p) and score (b, p) at the optimum.
 
     Whitened by S^-1/2, block scores have covariance s^2 Z_b (I - Z_b) under white noise, Z_b the block's share of the
     information; (I - Z_b)^-1/2 makes the sum unbiased (the CR2 of Bell and McCaffrey 2002). With few blocks the sum is
     itself uncertain, so it is shrunk towards its mean factor with the weight of 2 p blocks (as Ledoit and Wolf 2004 do).
+    `prior` (p, p) is information that no block holds, in their units: one more block, whose score is what it claims to be.
     """
     p = S_blocks.shape[-1]
-    F = _inverse_root(S_blocks.sum(axis=0), scales)
+    prior = np.zeros((p, p)) if prior is None else prior
+    F = _inverse_root(S_blocks.sum(axis=0) + prior, scales)
     values, vectors = np.linalg.eigh(F.T @ S_blocks @ F)
     # A block that carries nearly all the information of a direction cannot be checked by the others; cap its correction.
     gain = 1 / np.sqrt(np.clip(1 - values, 0.1, 1.0))
     h = np.einsum("bij,bj->bi", vectors * gain[:, None, :], np.einsum("bji,bj->bi", vectors, scores @ F))
-    W = h.T @ h
-    blocks, prior = len(S_blocks), 2.0 * p
-    W = (blocks * W + prior * np.trace(W) / p * np.eye(p)) / (blocks + prior)
+    W = h.T @ h + variance_factor * F.T @ prior @ F
+    blocks, pull = len(S_blocks), 2.0 * p
+    W = (blocks * W + pull * np.trace(W) / p * np.eye(p)) / (blocks + pull)
     return Covariance(variance_factor * F @ F.T, F @ W @ F.T, variance_factor, blocks)
 
 
-def covariance_in_time(S: Array, scores: Array, t_s: Array, variance_factor: float, scales: Array) -> Covariance:
+def covariance_in_time(
+    S: Array, scores: Array, t_s: Array, variance_factor: float, scales: Array, prior: Array | None = None
+) -> Covariance:
     """Return the covariance for information and scores of epochs at t_s, with blocks as long as the residuals are correlated.
 
     Blocks are 1, 2, 4, ... s long while at least nine remain; the length that shows the most correlation is taken (batch means
@@ -95,7 +99,7 @@ def covariance_in_time(S: Array, scores: Array, t_s: Array, variance_factor: flo
         S_blocks, g_blocks = np.zeros((count, *S.shape[1:])), np.zeros((count, S.shape[-1]))
         np.add.at(S_blocks, block, S)
         np.add.at(g_blocks, block, scores)
-        choices.append(covariance(S_blocks, g_blocks, variance_factor, scales))
+        choices.append(covariance(S_blocks, g_blocks, variance_factor, scales, prior))
         length *= 2
     return max(choices, key=lambda c: float(np.mean(c.factors**2)))
 

@@ -51,6 +51,13 @@ class CameraModel(Protocol):
         """Return parameters (p,) of the undistorted lens with this focal length and centre in px."""
         ...
 
+    def prior(self, params: Array, reach: float) -> tuple[Array, Array]:
+        """Return residuals (k,) in sigmas of what is known of real lenses before any is measured, and their Jacobian (k, p).
+
+        `reach` is tan^2 of the outermost angle that was seen.
+        """
+        ...
+
 
 def planes(shape: tuple[int, ...], columns: int) -> tuple[Array, Array]:
     """Return zeros as planes (2, columns, ...) to write to, and the same memory seen as (..., 2, columns)."""

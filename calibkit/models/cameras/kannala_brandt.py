@@ -30,6 +30,9 @@ class KannalaBrandt:
     def seed(self, focal: float, centre: tuple[float, float]) -> Array:
         return np.array([focal, focal, *centre, 0.0, 0.0, 0.0, 0.0])
 
+    def prior(self, params: Array, reach: float) -> tuple[Array, Array]:
+        return np.zeros(0), np.zeros((0, 8))
+
     def _max_theta(self, params: Array) -> float:
         return float(np.sqrt(first_turning_point(np.array([1.0, *(params[4:8] * [3, 5, 7, 9])]), np.pi**2)))
 

@@ -12,6 +12,9 @@ from calibkit.models.cameras.base import Array, Mask, Projection, first_turning_
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _MAX_RADIUS = 20.0  # tan(87 deg): beyond it a pinhole is no model of anything
 _NEWTON_STEPS = 12
+_PRIOR_NODES, _PRIOR_SIGMA = 24, 0.5
+_PRIOR_REACH = 1.25  # of r2: the image goes on behind its outermost corners
+_LEAST_DENOMINATOR = 0.02
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,23 @@ class PinholeRadtan:
 
     def seed(self, focal: float, centre: tuple[float, float]) -> Array:
         return np.array([focal, focal, *centre] + [0.0] * self.coefficients)
+
+    def prior(self, params: Array, reach: float) -> tuple[Array, Array]:
+        """Return (1/d - 1) / sigma of the denominator d at r2 evenly up to beyond the reach, together worth three measurements.
+
+        Where corners do not tell its coefficients, a root of d otherwise settles beside one of the numerator: they cancel but for a
+        spike between the corners or behind them, and the sigmas of a linearised fit mean nothing. 1/d lets a d that grows be.
+        """
+        p = 4 + self.coefficients
+        if self.coefficients < 8:
+            return np.zeros(0), np.zeros((0, p))
+        powers = np.linspace(0, min(_PRIOR_REACH * reach, _MAX_RADIUS**2), _PRIOR_NODES + 1)[1:, None] ** [1, 2, 3]
+        d = 1 + powers @ params[9:]
+        inside = np.maximum(d, _LEAST_DENOMINATOR)  # below, the tangent goes on: finite, and it pulls back
+        share = np.sqrt(3 / _PRIOR_NODES) / _PRIOR_SIGMA
+        J = np.zeros((_PRIOR_NODES, p))
+        J[:, 9:] = -share * powers / inside[:, None] ** 2
+        return share * (1 / inside + (inside - d) / inside**2 - 1), J
 
     def _radial(self, params: Array) -> tuple[Array, Array]:
         """Return numerator and denominator coefficients of q in ascending powers of r2."""

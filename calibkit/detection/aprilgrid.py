@@ -154,10 +154,12 @@ def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed:
         if not len(todo):
             break
         corners, ok = _fit(image, start, window)
-        good = (ok.sum(1) >= 3) & _inside(image, corners).all(1) & april_tags.verify(image, ask[todo].astype(np.int32), corners)
+        enough, inside = ok.sum(1) >= 3, _inside(image, corners).all(1)
+        good = enough & inside
+        good[good] = april_tags.verify(image, ask[todo[good]].astype(np.int32), corners[good])
         out.corners[todo], out.ok[todo], out.good[todo] = corners, ok, good
         uv[ask[todo]], fitted[ask[todo]] = corners, ok
-        todo = todo[~good]
+        todo = todo[~good & (inside | ~enough)]  # three corners say where the fourth is: out of view
         if not len(todo):
             break
     return out

@@ -41,15 +41,15 @@ def sample(image: Smoothed, uv: Array) -> Array:
     Not cv2.remap: that one rounds to 1/32 px.
     """
     h, w = image.shape
-    x, y = np.clip(uv[..., 0], 0, w - 1.001), np.clip(uv[..., 1], 0, h - 1.001)
+    x, y = (np.minimum(np.maximum(uv[..., axis], 0), size - 1.001) for axis, size in enumerate((w, h)))
     column, row = x.astype(np.intp), y.astype(np.intp)
     x -= column
     y -= row
     k = row * w + column
     flat = image.ravel()
-    top, bottom = flat[k], flat[k + w]
-    top = top + x * (flat[k + 1] - top)
-    bottom = bottom + x * (flat[k + w + 1] - bottom)
+    top, bottom = flat.take(k), flat.take(k + w)
+    top = top + x * (flat.take(k + 1) - top)
+    bottom = bottom + x * (flat.take(k + (w + 1)) - bottom)
     out: Array = top + y * (bottom - top)
     return out
 

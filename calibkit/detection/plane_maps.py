@@ -1,6 +1,7 @@
 """Maps of the board's plane to the image, from the corners already found: homographies, and what a lens bends on top of them."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ Array = NDArray[np.float64]
 _NEAR = 0.75  # steps of the board over which neighbours tell where a corner is
 _STIFFNESS = 1e-3  # of the bending, so that few neighbours bend nothing
 _STIFF = np.diag([1e-9, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])  # a lone tag's map bends as little as it can
-_NEIGHBOURS = 64  # that a local map is made of: further ones would weigh 0.01 or less
+_NEIGHBOURS = 40  # that a local map is made of: further ones would hardly weigh
 
 
 def apply(H: Array, xy: Array) -> Array:
@@ -86,6 +87,29 @@ class LocalMaps:
     Q: Array  # (n, 3, 2): d2/dx2, d2/dxdy, d2/dy2
 
 
+@dataclass(frozen=True)
+class _Neighbours:
+    """What local maps around some corners are made of, whatever image they are in."""
+
+    near: NDArray[np.intp]  # (n, k) corners around each, itself included
+    gain: Array  # (n, 10, k) from their uv to the map
+    misfit: Array  # (n,) from a corner's distance to its map to that from the map that its neighbours alone make
+
+
+@lru_cache(maxsize=8)  # most images of a recording show all corners
+def _neighbours(points: bytes, reach: float) -> _Neighbours:
+    xy = np.frombuffer(points).reshape(-1, 2)
+    near = cKDTree(xy).query(xy, min(_NEIGHBOURS, len(xy)))[1].reshape(len(xy), -1)
+    x, y = np.moveaxis(xy[near] - xy[:, None], -1, 0) / reach
+    xx, yy = x * x, y * y
+    terms = np.stack([np.ones_like(x), x, y, xx / 2, x * y, yy / 2, x * xx / 6, xx * y / 2, x * yy / 2, y * yy / 6], axis=-1)
+    weighted = np.swapaxes(terms * np.exp(-(xx + yy) / 2)[..., None], 1, 2)
+    inverse = np.linalg.inv(weighted @ terms + _STIFF)
+    units = np.repeat(1 / reach ** np.arange(4), [1, 2, 3, 4])[:, None]
+    leverage = np.minimum(inverse[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1, its terms are 1, 0, 0, ...
+    return _Neighbours(near, units * (inverse @ weighted), 1 / np.sqrt(1 - leverage))
+
+
 def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
     """Fit `uv = c + J d + Q(d, d) / 2 + C(d, d, d) / 6` around each corner by least squares with weights exp(-|d|^2 / (2 reach^2)).
 
@@ -93,17 +117,10 @@ def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
     corners err by 0.001 px together, which is 0.03 px of focal length. Also returns each corner's distance (n,) px to the map that its
     neighbours alone make, scaled by how well they can tell: large where a corner does not belong to the pattern.
     """
-    _, near = cKDTree(xy).query(xy, min(_NEIGHBOURS, len(xy)))
-    near = near.reshape(len(xy), -1)
-    x, y = np.moveaxis(xy[near] - xy[:, None], -1, 0) / reach
-    xx, yy = x * x, y * y
-    terms = np.stack([np.ones_like(x), x, y, xx / 2, x * y, yy / 2, x * xx / 6, xx * y / 2, x * yy / 2, y * yy / 6], axis=-1)
-    weighted = np.swapaxes(terms * np.exp(-(xx + yy) / 2)[..., None], 1, 2)
-    inverse = np.linalg.inv(weighted @ terms + _STIFF)
-    c = inverse @ (weighted @ uv[near])
-    leverage = np.minimum(inverse[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1, its terms are 1, 0, 0, ...
-    misfit: Array = np.linalg.norm(uv - c[:, 0], axis=-1) / np.sqrt(1 - leverage)
-    return LocalMaps(np.swapaxes(c[:, 1:3], 1, 2) / reach, c[:, 3:6] / reach**2), misfit
+    around = _neighbours(np.ascontiguousarray(xy, float).tobytes(), reach)
+    c = around.gain @ uv[around.near]
+    misfit: Array = np.linalg.norm(uv - c[:, 0], axis=-1) * around.misfit
+    return LocalMaps(np.swapaxes(c[:, 1:3], 1, 2), c[:, 3:6]), misfit
 
 
 def in_line(misfit: Array, allowed_px: Array) -> NDArray[np.bool_]:

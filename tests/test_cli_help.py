@@ -13,6 +13,7 @@ from calibkit.cli import main as cli
 from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.version import __version__
 
+CHECK = "; check the path, its permissions and the room on the disk"
 HEAVY = ("cv2", "jinja2", "matplotlib", "numba", "numpy", "pydantic", "rich", "rosbags", "scipy", "yaml")
 LIST_MODULES = """
 import json, sys
@@ -128,8 +129,9 @@ def test_usage_errors_are_one_line(run: Run, boom: Raise, arguments: list[str], 
     [
         (BadInputError("a.bag: no topic\n\x1b[31m/cam0; give --camera"), 2, "calibkit: a.bag: no topic [31m/cam0; give --camera"),
         (NotConvergedError("no answer"), 4, "calibkit: no answer"),
-        (FileNotFoundError(2, "No such file or directory", "a.bag"), 2, "calibkit: [Errno 2] No such file or directory: 'a.bag'"),
-        (PermissionError(13, "Permission denied", "out"), 2, "calibkit: [Errno 13] Permission denied: 'out'"),
+        (FileNotFoundError(2, "No such file or directory", "a.bag"), 2, f"calibkit: a.bag: No such file or directory{CHECK}"),
+        (PermissionError(13, "Permission denied", "out"), 2, f"calibkit: out: Permission denied{CHECK}"),
+        (OSError(28, "No space left on device"), 2, f"calibkit: [Errno 28] No space left on device{CHECK}"),
         (ValueError("odd"), 4, "calibkit: internal error: ValueError: odd (please report it with --debug's output)"),
         (EOFError("cut"), 4, "calibkit: internal error: EOFError: cut (please report it with --debug's output)"),
         (KeyboardInterrupt(), 130, "calibkit: interrupted"),

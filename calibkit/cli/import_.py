@@ -19,9 +19,11 @@ def run(
     """Turn other tools' calibration files into one rig file."""
     import shlex
 
+    from calibkit.cli.paths import refuse_clashes
     from calibkit.errors import one_line
     from calibkit.stages.convert import import_files
 
+    refuse_clashes(files, [out])
     command = shlex.join(["calibkit", "import", *map(str, files), "-o", str(out)])
     outcome = import_files(files, out, force, command)
     for note in outcome.notes:

@@ -25,10 +25,12 @@ def run(
     force: Annotated[bool, typer.Option("--force", help="Overwrite FILE.")] = False,
 ) -> None:
     """Show topics, rates and duration of a recording, what is wrong with it, and what each topic could be used for."""
+    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.errors import one_line
     from calibkit.stages.info import info
 
+    refuse_clashes(sources, [json_file])
     result = info(sources, ros_distro, json_file, force, bar)
     _show(result)
     if json_file is not None:

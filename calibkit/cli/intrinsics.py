@@ -53,6 +53,7 @@ def run(
 
     Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
     """
+    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
     from calibkit.errors import BadInputError
@@ -61,6 +62,8 @@ def run(
 
     if loss not in ("robust", "plain"):
         raise BadInputError("--loss is robust or plain")
+    refuse_clashes([*sources, target], [out, report, json_file])
+    refuse_clashes(rig or (), [report, json_file])  # OUT may be a rig: it is then updated
     options = Options(
         cameras=tuple(camera or ()),
         models=tuple(model or (AUTO,)),

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibkit.errors import CalibkitError, one_line
+from calibkit.errors import BadInputError, CalibkitError, one_line
 from calibkit.version import __version__
 
 # One module `calibkit.cli.NAME` a command, with `register(app)`; --help lists them in this order.
@@ -53,6 +53,8 @@ def main() -> None:
         os.environ.setdefault(variable, "1")
     arguments = sys.argv[1:]
     try:
+        if "" in arguments:
+            raise BadInputError("an argument is empty: is a variable of the shell unset?")
         code = app(_anywhere_first(arguments) or ["--help"], prog_name="calibkit", standalone_mode=False)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
@@ -63,7 +65,8 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:
-        _fail(error, 2, one_line(error))
+        what = f"{one_line(error.filename, 120)}: {error.strerror}" if error.filename and error.strerror else one_line(error)
+        _fail(error, 2, f"{what}; check the path, its permissions and the room on the disk")
     except Exception as error:
         cause = error.__cause__ if isinstance(error, typer.Abort) and error.__cause__ else error  # Typer's Abort hides an EOFError
         _fail(cause, 4, f"internal error: {type(cause).__name__}: {one_line(cause)} (please report it with --debug's output)")

@@ -26,11 +26,13 @@ def report(
 
     Exit code 1 on FAIL, which includes parameters that are not observable; 2 when a file is missing or was changed.
     """
+    from calibkit.cli.paths import refuse_clashes
     from calibkit.data.verdict import Verdict
     from calibkit.errors import one_line
     from calibkit.report.summary import text
     from calibkit.stages import report as stage
 
+    refuse_clashes([rig], [out, json_file])
     summary = stage.report(rig, out, json_file, force)
     typer.echo(text(summary))
     if out is not None:

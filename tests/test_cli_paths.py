@@ -1,0 +1,64 @@
+"""Arguments that would destroy an input or name nothing are refused in one line, and what they name stays as it is."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from calibkit.cli.main import main
+
+
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def run(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        assert (end.value.code, said.out, len(said.err.splitlines())) == (2, "", 1), said
+        return said.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["info", "a", "--json", "a"], "an input"),
+        (["info", "b", "a", "--json", "./link"], "an input"),
+        (["intrinsics", "a", "--target", "b", "-o", "b"], "an input"),
+        (["intrinsics", "a", "--target", "b", "-o", "a"], "an input"),
+        (["intrinsics", "a", "--target", "b", "--json", "hard"], "an input"),
+        (["intrinsics", "a", "--target", "b", "--report", "a"], "an input"),
+        (["intrinsics", "a", "--target", "b", "--rig", "c", "-o", "c", "--json", "c"], "an output"),
+        (["intrinsics", "a", "--target", "b", "--rig", "c", "--json", "c"], "an input"),
+        (["intrinsics", "a", "--target", "b", "-o", "new", "--json", "./new"], "an output"),
+        (["intrinsics", "a", "--target", "b", "-o", "new", "--report", "new"], "an output"),
+        (["report", "a", "--json", "a"], "an input"),
+        (["report", "a", "--json", "new", "-o", "new"], "an output"),
+        (["import", "b", "a", "-o", "a"], "an input"),
+    ],
+    ids=" ".join,
+)
+def test_an_output_over_an_input_or_another_output_is_refused(words, what, refused, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in "abc":
+        Path(name).write_text(name)
+    Path("link").symlink_to("a")
+    os.link("a", "hard")
+    assert f"is {what} of this command, too; give another name" in refused(*words, "--force")
+    assert [Path(name).read_text() for name in "abc"] == ["a", "b", "c"]
+    assert not Path("new").exists()
+
+
+@pytest.mark.parametrize("words", [["info", ""], ["intrinsics", "a", "--target", ""], ["import", "a", "-o", ""], ["info", "--", ""]])
+def test_an_empty_argument_is_an_unset_variable_and_not_this_folder(words, refused) -> None:
+    assert refused(*words) == "calibkit: an argument is empty: is a variable of the shell unset?\n"
+
+
+def test_an_error_of_the_system_comes_with_a_remedy(refused) -> None:
+    told = refused("info", "a" * 5000)
+    assert "File name too long" in told
+    assert "check the path, its permissions" in told
+    assert "Errno" not in told

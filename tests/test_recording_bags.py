@@ -131,6 +131,20 @@ def test_several_bags_are_one_recording_in_time_order(tmp_path: Path) -> None:
     assert imu.gyro[:, 0].tolist() == [0.0] * 5 + [1.0] * 5
 
 
+def test_a_recording_given_twice_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, "ros1", _messages("ros1"))
+    (tmp_path / "link.bag").symlink_to(path)
+    (tmp_path / "other").mkdir()
+    for sources in ([path, path], [path, tmp_path / "other" / ".." / "rec.bag"], [path, tmp_path / "link.bag"], [tmp_path, path]):
+        with pytest.raises(BadInputError, match=r"rec\.bag is given twice: give each recording once"):
+            open_recording(sources)
+
+
+def test_a_folder_of_ros_1_bags_needs_no_metadata(tmp_path: Path) -> None:
+    write(tmp_path, "ros1", _messages("ros1"))
+    assert open_recording([tmp_path]).warnings == []
+
+
 def test_a_topic_is_chosen_or_the_candidates_are_named(tmp_path: Path) -> None:
     make = Make("mcap")
     image = np.zeros((4, 4), np.uint8)
@@ -141,7 +155,9 @@ def test_a_topic_is_chosen_or_the_candidates_are_named(tmp_path: Path) -> None:
         recording.choose("image")
     with pytest.raises(BadInputError, match="there is no topic /middle; it has /left, /right"):
         recording.choose("image", "/middle")
-    with pytest.raises(BadInputError, match="it has no imu topic"):
+    with pytest.raises(BadInputError, match="there is no topic \\(empty\\)"):
+        recording.choose("image", "")
+    with pytest.raises(BadInputError, match="it has no imu topic \\(calibkit info lists what it has\\)"):
         recording.choose("imu")
     with pytest.raises(BadInputError, match="/left is sensor_msgs/msg/Image, not an imu topic"):
         recording.imu("/left")

@@ -1,5 +1,6 @@
 """What a path given as SOURCE is: a bag, a folder of images, an ASL folder, a folder of several of these, or CSV."""
 
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -19,7 +20,20 @@ def open_sources(paths: list[Path], distro: str | None) -> list[Source]:
     absolute = [Path(path).absolute() for path in paths]
     times = Counter(path.name for path in absolute if path.is_dir() or path.suffix.lower() in _TABLES)
     names = [f"{path.parent.name}/{path.name}" if times[path.name] > 1 else path.name for path in absolute]
-    return [source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro)]
+    sources = [source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro)]
+    if len(paths) > 1:
+        _refuse_repeats(sources)
+    return sources
+
+
+def _refuse_repeats(sources: list[Source]) -> None:
+    """What is read twice would count twice, and every sigma come out too small."""
+    seen: set[str] = set()
+    for source in sources:
+        files = {os.path.realpath(file) for file in source.files}
+        if repeated := min(files & seen, default=None):
+            raise BadInputError(f"{one_line(Path(repeated).name, 120)} is given twice: give each recording once")
+        seen |= files
 
 
 def _open(path: Path, name: str, distro: str | None) -> list[Source]:

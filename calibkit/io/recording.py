@@ -50,14 +50,14 @@ class Recording:
     def choose(self, kind: str, asked: str | None = None) -> str:
         """Return the topic of a kind: the one asked for, or the only one; BadInputError lists the candidates."""
         candidates = [topic.name for topic in self.topics if topic.kind == kind]
-        offered = f"it has {', '.join(candidates)}" if candidates else f"it has no {kind} topic"
+        offered = f"it has {', '.join(candidates)}" if candidates else f"it has no {kind} topic (calibkit info lists what it has)"
         if asked is not None:
             self._refuse_video([topic for topic in self.topics if topic.name == asked])
             if asked in candidates:
                 return asked
             found = next((topic.type for topic in self.topics if topic.name == asked), None)
             wanted = f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} topic"
-            what = f"{one_line(asked)} is {found}, not {wanted}" if found else f"there is no topic {one_line(asked)}"
+            what = f"{one_line(asked)} is {found}, not {wanted}" if found else f"there is no topic {one_line(asked) or '(empty)'}"
             raise BadInputError(f"{self.name}: {what}; {offered}")
         if len(candidates) == 1:
             return candidates[0]

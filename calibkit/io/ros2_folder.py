@@ -98,6 +98,8 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
 def _metadata(path: Path, warnings: list[str]) -> dict[str, Any]:
     """Return rosbag2_bagfile_information, or nothing where it cannot be read: the data files stand by themselves."""
     if not path.exists():
+        if not any(_kind(file) in (".mcap", ".db3") for file in path.parent.iterdir()):
+            return {}  # ROS 1 has none
         warnings.append(f"{path.parent.name}: no {METADATA}; the data files in the folder are read")
         return {}
     try:

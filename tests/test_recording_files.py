@@ -106,6 +106,31 @@ def test_an_asl_folder_holds_all_its_sensors(tmp_path: Path, given: str) -> None
     assert any("cam1: 1 rows of data.csv are not" in w for w in recording.warnings)
 
 
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ("t [s],wx [rpm],wy [rpm],wz [rpm],ax,ay,az", r"\[rpm\] of column wx is not known: use one of rad/s, .*deg/s"),
+        ("t [s],wx,wy,wz,ax [m/s^2],ay [ft/s^2],az [m/s^2]", r"\[ft/s\^2\] of column ay is not known: use one of m/s\^2"),
+        ("t [min],wx,wy,wz,ax,ay,az", r"\[min\] of column t is not known: use one of ns, us"),
+    ],
+)
+def test_a_unit_that_is_not_known_is_refused_and_not_taken_for_si(header: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "imu.csv").write_text(f"{header}\n1,2,3,4,5,6,7\n2,2,3,4,5,6,7\n")
+    with pytest.raises(BadInputError, match=told):
+        open_recording([tmp_path / "imu.csv"])
+    (tmp_path / "other.csv").write_text("t,wx,wy,wz,ax,ay,az\n1,2,3,4,5,6,7\n")
+    recording = open_recording([tmp_path])
+    assert [topic.name for topic in recording.topics] == ["other"]
+    assert any("is not known" in warning for warning in recording.warnings)
+
+
+def test_each_column_has_its_own_unit(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("t [ms],x [mm],y [cm],z [m],qx,qy,qz,qw\n1000,1500,150,1.5,0,0,0,1\n")
+    poses = open_recording([tmp_path / "p.csv"]).poses("p")
+    np.testing.assert_allclose(poses.p, [[1.5, 1.5, 1.5]], rtol=1e-15)
+    assert poses.t_ns.tolist() == [10**9]
+
+
 def test_a_stamp_beyond_any_time_is_no_row(tmp_path: Path) -> None:
     _image(tmp_path / "cam0" / "data" / "a.png", 7)
     (tmp_path / "cam0" / "data.csv").write_text(f"{T0},a.png\n9999999999999999999,a.png\n")

@@ -46,10 +46,18 @@ _NAMES = {
     "sigma_px": ("sigma_px", "sigma"),
 }
 _CANONICAL = {name: key for key, names in _NAMES.items() for name in names}
-_TIME_UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
-_GYRO_UNITS = {"deg/s": np.pi / 180, "deg s^-1": np.pi / 180, "dps": np.pi / 180}
-_ACCEL_UNITS = {"g": G, "mg": G / 1000}
 _GYRO, _ACCEL, _XYZ, _Q = ("wx", "wy", "wz"), ("ax", "ay", "az"), ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+# Units as headers write them, lower case; of none SI is meant, and a time's is guessed from its size.
+_TIME_UNITS = {"": 0, "ns": 1, "us": 10**3, "µs": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
+_GYRO_UNITS = {**dict.fromkeys(("", "rad/s", "rad s^-1"), 1.0), **dict.fromkeys(("deg/s", "deg s^-1", "dps"), np.pi / 180)}
+_ACCEL_UNITS = {**dict.fromkeys(("", "m/s^2", "m s^-2", "m/s2", "m/s²", "m/s/s"), 1.0), "g": G, "mg": G / 1000}
+_LENGTH_UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
+_UNITS: dict[str, Mapping[str, float]] = {
+    "t": _TIME_UNITS,
+    **dict.fromkeys(_GYRO, _GYRO_UNITS),
+    **dict.fromkeys(_ACCEL, _ACCEL_UNITS),
+    **dict.fromkeys(_XYZ, _LENGTH_UNITS),
+}
 
 
 class _Table(NamedTuple):
@@ -76,15 +84,24 @@ class _Table(NamedTuple):
         texts = [line.split(self.delimiter)[self.columns["t"]].strip() for line in self.lines]
         try:
             first = stamp_ns(texts[0])
-            unit = _TIME_UNITS.get(self.units["t"]) or (round(first / Decimal(texts[0])) if first else 10**9)
+            unit = int(self.unit("t")) or (round(first / Decimal(texts[0])) if first else 10**9)
             if unit == 1 and all(map(str.isdecimal, texts)):  # the same, and faster
                 return np.array(list(map(int, texts)), np.int64)
             return np.array([_whole(Decimal(text), unit) for text in texts], np.int64)
         except (ArithmeticError, ValueError) as error:
             raise BadInputError(f"{self.name}: its time column must hold numbers of ns, us, ms or s ({one_line(error, 80)})") from error
 
-    def scale(self, column: str, table: dict[str, float]) -> float:
-        return table.get(self.units[column], 1.0)
+    def scaled(self, *names: str) -> Array:
+        """Return the named columns (n, k) in SI."""
+        return self.numbers(*names) * [self.unit(name) for name in names]
+
+    def unit(self, name: str) -> float:
+        """Return what the unit of a column is worth in ns or SI; BadInputError where it is none that is known."""
+        stated, known = self.units[name], _UNITS[name]
+        if stated not in known:
+            choice = ", ".join(filter(None, known))
+            raise BadInputError(f"{self.name}: the unit [{one_line(stated, 40)}] of column {name} is not known: use one of {choice}")
+        return known[stated]
 
 
 def _whole(value: Decimal, unit: int) -> int:
@@ -136,8 +153,7 @@ _WANTED = (
 def _imu(path: Path, name: str, warn: Callable[[str], None]) -> ImuSamples:
     table = _table(path, name, warn)
     t_ns = table.times()
-    gyro = table.numbers(*_GYRO) * table.scale("wx", _GYRO_UNITS)
-    accel = table.numbers(*_ACCEL) * table.scale("ax", _ACCEL_UNITS)
+    gyro, accel = table.scaled(*_GYRO), table.scaled(*_ACCEL)
     good = plausible(gyro) & plausible(accel)
     if not good.all():
         warn(f"{name}: {np.sum(~good)} samples are not finite and left out")
@@ -146,7 +162,7 @@ def _imu(path: Path, name: str, warn: Callable[[str], None]) -> ImuSamples:
 
 def _poses(path: Path, name: str, topic: str, warn: Callable[[str], None]) -> PoseSamples:
     table = _table(path, name, warn)
-    samples, lost = unit_poses(table.times(), table.numbers(*_Q), table.numbers(*_XYZ), "world", topic)
+    samples, lost = unit_poses(table.times(), table.numbers(*_Q), table.scaled(*_XYZ), "world", topic)
     if lost:
         warn(f"{name}: {lost} poses have no proper rotation or are not finite, and are left out")
     return samples
@@ -158,7 +174,7 @@ def _corners(path: Path, name: str, warn: Callable[[str], None]) -> CornerRows:
     uv = table.numbers("u", "v")
     if not (np.all((tag >= 0) & (tag < 1e6) & (index >= 0) & (index < 4)) and np.isfinite(uv).all()):
         raise BadInputError(f"{name}: tag_id must be from 0, corner_idx from 0 to 3, u and v finite")
-    xyz = table.numbers(*_XYZ) if set(_XYZ) <= table.columns.keys() else None
+    xyz = table.scaled(*_XYZ) if set(_XYZ) <= table.columns.keys() else None
     sigma = table.numbers("sigma_px")[:, 0] if "sigma_px" in table.columns else None
     return CornerRows(name, table.times(), np.rint(4 * tag + index).astype(np.int64), uv, xyz, sigma)
 
@@ -176,10 +192,12 @@ def csv_source(path: Path, topic: str) -> Source:
     name = one_line(path.name, 120)
     source = Source(name if path.stem == topic else f"{topic}/{name}", [path])
     table = _table(path, source.name, source.warn)
-    found = next(((kind, title) for kind, title, needed in _KINDS if needed <= table.columns.keys()), None)
+    found = next((entry for entry in _KINDS if entry[2] <= table.columns.keys()), None)
     if found is None:
         raise BadInputError(f"{source.name} is not recognised: {_WANTED}")
-    kind, title = found
+    kind, title, needed = found
+    for column in sorted(needed & _UNITS.keys()):
+        table.unit(column)  # refused now, so that a folder's other files are still read
     source.topics.append(TopicInfo(topic, title, kind, len(table.lines)))
     source.corners.update({topic: partial(_corners, path, source.name, source.warn)} if kind == "corners" else {})
     source.imu.update({topic: partial(_imu, path, source.name, source.warn)} if kind == "imu" else {})

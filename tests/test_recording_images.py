@@ -152,3 +152,16 @@ def test_compressed_messages(tmp_path: Path) -> None:
     assert first.label == "1700000000.000000000"
     with pytest.raises(BadInputError, match="/depth/compressedDepth is video- or depth-coded"):
         recording.images("/depth/compressedDepth")
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", r"a\.png: not a readable image \(it is empty\); jpeg, png"),
+        (b"no image at all", r"a\.png: not a readable image \(damaged, or of another kind\); jpeg, png"),
+        (b"P5 40000 40000 255\n", r"a\.png: .*too large; at most 150000000 pixels"),
+    ],
+)
+def test_why_an_image_cannot_be_read_is_said_in_words(data: bytes, told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        decode_compressed(data, "a.png")

@@ -8,7 +8,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from calibkit.errors import BadInputError, one_line
 from calibkit.opencv import cv2
@@ -90,8 +90,12 @@ def decode_compressed(data: bytes | NDArray[np.uint8], where: str) -> Gray:
     try:
         with Image.open(io.BytesIO(bytes(data)), formats=_FORMATS) as header:
             width, height = header.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise BadInputError(f"{where}: not a readable image ({one_line(error, 120)}); jpeg, png, bmp, pgm and tiff are read") from error
+    except (OSError, ValueError, SyntaxError) as error:
+        what = "damaged, or of another kind" if isinstance(error, UnidentifiedImageError) else one_line(error, 120)
+        reason = what if len(data) else "it is empty"
+        raise BadInputError(f"{where}: not a readable image ({reason}); jpeg, png, bmp, pgm and tiff are read") from error
+    except Image.DecompressionBombError as error:
+        raise BadInputError(f"{where}: the image is too large; at most {MAX_PIXELS} pixels are read") from error
     if not 0 < width * height <= MAX_PIXELS:
         raise BadInputError(f"{where}: an image of {width} x {height} is too large; at most {MAX_PIXELS} pixels are read")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

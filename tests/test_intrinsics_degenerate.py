@@ -118,6 +118,16 @@ def test_one_or_two_views(frames, quick):
     assert_nothing_known(calibrate(board_views(CAMERA, frames, 0)), "at least 3 are needed")
 
 
+@pytest.mark.parametrize(("frames", "told"), [(4, True), (9, True), (10, False)])
+def test_fewer_than_ten_looks_are_told(frames, told, quick):
+    result = calibrate(board_views(CAMERA, frames, 0), "pinhole-radtan")
+    assert (f"{frames} views are {frames} independent looks at the board, too few" in texts(result, Verdict.CHECK)) == told
+
+
+def test_one_view_is_one_look(quick):
+    assert "1 view is 1 independent look at the board," in texts(calibrate(board_views(CAMERA, 1, 0)))
+
+
 def hasty(duration_s: float) -> BoardViews:
     scenario = SCENARIOS["aprilgrid"]
     camera = replace(scenario.cameras[0], rate_hz=20.0)

@@ -12,9 +12,11 @@ from lens_samples import LENSES, T_CAM1_CAM0, board_views, rig_views
 from scipy.stats import chi2
 
 from calibkit.data.observations import BoardViews
+from calibkit.data.verdict import Status
 from calibkit.estimation.camera_rig_seed import match_instants
 from calibkit.estimation.lens_fit import fit_lenses
 from calibkit.estimation.lens_trust import lens_covariance
+from calibkit.estimation.lens_verdict import judge_lens
 from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid
 from calibkit.models.cameras import CAMERAS
@@ -134,6 +136,30 @@ def test_the_prior_does_not_move_a_rational_lens_that_corners_tell(params: list[
     without = fit_lenses([views], [model.name], (np.arange(views.n_frames),))
     assert np.abs((fit.state.lenses[0] - without.state.lenses[0]) / sigma).max() < 0.15
     np.testing.assert_allclose(sigma, np.sqrt(np.diag(lens_covariance(without).corrected)), rtol=0.1)
+
+
+def pooled_of_few_images(frames: int, seeds: int) -> float:
+    """Return the rms of (estimate - truth) / sigma over all parameters of pinhole-radtan lenses that are called determined or weak."""
+    z = []
+    for seed in range(seeds):
+        views = board_views("pinhole-radtan", frames, seed)
+        fit = fit_lenses([views], ["pinhole-radtan"], (np.arange(views.n_frames),))
+        covariance = lens_covariance(fit)
+        if Status.NOT_OBSERVABLE not in judge_lens(fit, 0, covariance, []).statuses:
+            z.append((fit.state.lenses[0] - LENSES["pinhole-radtan"].params) / np.sqrt(np.diag(covariance.corrected)))
+    print(f"{frames} images: {len(z)} of {seeds} seeds give a lens, pooled {np.sqrt(np.mean(np.square(z))):.3f}")
+    return float(np.sqrt(np.mean(np.square(z))))
+
+
+@pytest.mark.parametrize("frames", [3, 4])
+def test_few_images_do_not_give_small_sigmas(frames: int) -> None:
+    assert 0.7 < pooled_of_few_images(frames, 15) < 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [3, 4, 6, 10, 20, 40])
+def test_few_images_do_not_give_small_sigmas_over_sixty_seeds(frames: int) -> None:
+    assert 0.8 < pooled_of_few_images(frames, 60) < 1.25
 
 
 @pytest.mark.parametrize(("model", "flags"), [("pinhole-radtan", cv2.CALIB_FIX_K3), ("pinhole-radtan5", 0)])

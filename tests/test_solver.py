@@ -208,6 +208,23 @@ def test_with_fewer_blocks_than_can_tell_the_factors_are_shrunk_to_their_mean(co
     assert within < 0.1 * count / 3  # between parameters of one run
 
 
+@pytest.mark.parametrize("number", [3, 6, 10])
+def test_few_blocks_never_claim_less_than_white_noise_does(number):
+    """A sandwich of 3 to 6 blocks falls short by chance: pooled errors were 1.2 to 1.4 of it."""
+    p = 6
+    for seed in range(40):
+        S, g = blocks(seed, number, p)
+        found = covariance_in_time(S, g, np.arange(float(number)), 1.0, np.geomspace(1, 1e-4, p))
+        assert found.blocks == number
+        assert np.all(found.factors >= 1 - 1e-9)
+
+
+def test_many_blocks_may_claim_less_than_white_noise_does():
+    S, g = blocks(0, 100, 6)
+    found = covariance_in_time(S, 0.5 * g, np.arange(100.0), 1.0, np.geomspace(1, 1e-4, 6))
+    assert np.all(found.factors < 0.7)
+
+
 def test_the_covariance_does_not_depend_on_units():
     S, g = blocks(0, 20, 4)
     units = np.array([1.0, 1e3, 1e-6, 1e2])

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.estimation.lens_fit import LensFit, instant_times
 from calibkit.estimation.lens_trust import PixelEffect, ProjectionSigma, border_scales, orientations, pixel_effect, projection_sigma
 from calibkit.estimation.model_choice import ModelScore
 from calibkit.estimation.view_advice import best_view, region_of
 from calibkit.geometry.so3 import Array
-from calibkit.solver.trust import WEAK, Covariance, grade
+from calibkit.solver.trust import FEW_BLOCKS, WEAK, Covariance, grade
 
 MIN_LOOKS = 3  # orientations, and seconds: two numbers of fx fy cx cy a look, and one look to check them
 _WORSE_MODEL, _WRONG_MODEL = 1.1, 2.0  # held-out error over the best model's
@@ -50,20 +51,36 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     statuses = tuple(Status(grade(float(px))) for px in known)
     if hopeless:  # more views of a board that is not what the target says would not help
         return LensJudgement(statuses, (*hopeless, *reasons), projection)
+    reasons += _few_looks_reasons(fit, c)
     reasons += _direction_reasons(fit, c, covariance.variance_factor, cov, effect)
     reasons += _extrapolation_reasons(camera, views.image_size, projection)
     return LensJudgement(statuses, tuple(reasons), projection)
 
 
+def _looks(fit: LensFit, c: int) -> tuple[int, str]:
+    """Return how many seconds have views of the board, or images where there are no stamps, and say so."""
+    instants = fit.problem.cameras[c].instant
+    looks = len(np.unique(np.floor(instant_times(fit)[instants])))
+    span = f" within {looks} s" if fit.views[c].t_ns.any() else ""
+    verb = "is" if len(instants) == 1 else "are"
+    return looks, f"{counted(len(instants), 'view')}{span} {verb} {counted(looks, 'independent look')} at the board"
+
+
+def _few_looks_reasons(fit: LensFit, c: int) -> list[Reason]:
+    looks, told = _looks(fit, c)
+    if looks >= FEW_BLOCKS:
+        return []
+    text = f"{told}, too few to show how far their errors are alike: sigmas take them as chance; record {FEW_BLOCKS} or more"
+    return [Reason(Verdict.CHECK, f"{fit.views[c].camera}: {text}")]
+
+
 def _too_few_looks(fit: LensFit, c: int) -> str:
     """Say why the views cannot tell a lens at all, or nothing."""
-    views = fit.problem.cameras[c]
-    seconds = len(np.unique(np.floor(instant_times(fit)[views.instant])))
-    if seconds < MIN_LOOKS:
-        span = f"{len(views.instant)} views within {seconds} s" if fit.views[c].t_ns.any() else f"{len(views.instant)} views"
+    looks, told = _looks(fit, c)
+    if looks < MIN_LOOKS:
         return (
-            f"the lens is not observable: {span} are {seconds} independent look{'s' if seconds > 1 else ''} at the board, at least "
-            f"{MIN_LOOKS} are needed; record 15 s or more with the board tilted 30 to 45 deg in all directions"
+            f"the lens is not observable: {told}, at least {MIN_LOOKS} are needed; "
+            "record 15 s or more with the board tilted 30 to 45 deg in all directions"
         )
     seen = orientations(fit.problem, fit, c)
     if seen.count < MIN_LOOKS:

@@ -1,12 +1,17 @@
 """Views chosen for information: fewer of them, nearly as much known; and advice that keeps its promise."""
 
+from dataclasses import replace
+
 import numpy as np
+from lens_samples import T_CAM1_CAM0, rig_views
 
 from calibkit.data.observations import BoardViews
+from calibkit.estimation.camera_rig_seed import match_instants
 from calibkit.estimation.lens_fit import LensFit, fit_lenses
 from calibkit.estimation.lens_trust import lens_covariance
 from calibkit.estimation.view_advice import best_view, region_of
 from calibkit.estimation.view_choice import choose_views, greedy_log_det
+from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid
 from calibkit.models.cameras import CAMERAS
 from calibkit.simulation.camera import SimCamera, random_board_poses
@@ -23,7 +28,8 @@ def _fit(views: BoardViews) -> LensFit:
 
 def test_few_views_are_left_alone() -> None:
     views, _ = simulate_board_views(CAMERA, BOARD, 12, seed=0)
-    assert choose_views(views, MODEL, 12) is views
+    chosen, _ = choose_views([views], [MODEL], (np.arange(12),), 12)
+    assert chosen[0] is views
 
 
 def test_chosen_views_know_more_than_evenly_spread_ones() -> None:
@@ -32,12 +38,29 @@ def test_chosen_views_know_more_than_evenly_spread_ones() -> None:
     still = np.repeat(random_board_poses(CAMERA, BOARD, 1, rng), 180, axis=0)
     moving = random_board_poses(CAMERA, BOARD, 20, rng)
     views, _ = views_of_poses(CAMERA, BOARD, np.concatenate([still, moving]), rng)
-    chosen = choose_views(views, MODEL, 40)
+    (chosen,), _ = choose_views([views], [MODEL], (np.arange(views.n_frames),), 40)
     spread = views.select(np.linspace(0, views.n_frames - 1, 40).astype(int))
     assert chosen.n_frames == 40
     assert len(set(chosen.labels) & {f"frame {k}" for k in range(180, 200)}) == 20
     sigma_chosen, sigma_spread = (np.sqrt(np.diag(lens_covariance(_fit(v)).plain)) for v in (chosen, spread))
     assert np.all(sigma_chosen < 0.7 * sigma_spread)
+
+
+def test_moments_that_cameras_share_are_kept() -> None:
+    """Each camera sees the board 100 times, both at once in 12 of these: the transform between them stands on the twelve."""
+    cameras = [CAMERA, replace(CAMERA, name="cam1")]
+    first, second = rig_views(cameras, [np.eye(4), T_CAM1_CAM0], 200, seed=3)
+    together = np.arange(0, 200, 17)
+    first = first.select(np.union1d(np.arange(94), together))
+    second = second.select(np.union1d(np.arange(106, 200), together))
+    instants = match_instants([first, second])
+    shared = np.intersect1d(*instants)
+    (a, b), (at_a, at_b) = choose_views([first, second], [MODEL, MODEL], instants, 40)
+    assert len(np.union1d(at_a, at_b)) == 40
+    assert len(np.intersect1d(at_a, at_b)) >= 0.9 * len(shared)
+    assert (a.n_frames, b.n_frames) == (len(at_a), len(at_b))
+    fit = fit_lenses([a, b], [MODEL, MODEL], (at_a, at_b))
+    assert np.linalg.norm(se3.local(T_CAM1_CAM0, fit.state.T_cam_cam0[1])) < 2e-3
 
 
 def test_greedy_choice_takes_every_direction_before_doubling_one() -> None:

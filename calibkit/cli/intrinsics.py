@@ -41,7 +41,7 @@ def run(
     loss: Annotated[
         str, typer.Option("--loss", help="robust (outliers are found and given up) or plain (least squares over everything).")
     ] = "robust",
-    max_views: Annotated[int, typer.Option("--max-views", min=10, help="Beyond this many, the most telling views are chosen.")] = 1500,
+    max_views: Annotated[int, typer.Option("--max-views", min=10, help="Beyond this many, the most telling moments are chosen.")] = 1500,
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")] = False,
     ros_distro: Annotated[
         str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")

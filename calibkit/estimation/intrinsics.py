@@ -50,12 +50,13 @@ def calibrate_cameras(requests: Sequence[CameraRequest], robust: bool = True, ma
     """
     scores = [compare_models(r.views, list(CAMERAS)) for r in progress(requests, "comparing lens models", len(requests))]
     models = [request.model or found[0].model for request, found in zip(requests, scores, strict=True)]
-    views = [choose_views(r.views, model, max_views) for r, model in zip(requests, models, strict=True)]
-    instants = match_instants(views)
+    instants = match_instants([request.views for request in requests])
     groups = components(instants)
     solved: list[_Solved] = []
     for group in progress(groups, "solving", len(groups)):
-        fit = fit_lenses([views[c] for c in group], [models[c] for c in group], tuple(instants[c] for c in group), robust)
+        of_group = [models[c] for c in group]
+        views, shared = choose_views([requests[c].views for c in group], of_group, tuple(instants[c] for c in group), max_views)
+        fit = fit_lenses(views, of_group, shared, robust)
         covariance = lens_covariance(fit)
         judged = tuple(judge_lens(fit, i, covariance, scores[c]) for i, c in enumerate(group))
         _refuse_unconverged(fit, judged)

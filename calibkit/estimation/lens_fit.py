@@ -95,11 +95,11 @@ def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: I
             )
         dropped += [DroppedView(views.camera, views.labels[i], "no board pose fits its corners") for i in np.flatnonzero(~found)]
         used.append(views.select(found))
-        grids.append(_rows(grid, found))
+        grids.append(rows_of(grid, found))
         lenses.append(lens)
         poses.append(seeds.T_cam_board[found])
         errors.append(seeds.error[found])
-    _renumber(grids)
+    renumber(grids)
     T_cam_cam0, T_cam0_board = seed_rig(tuple(g.instant for g in grids), poses, errors)
     problem = CameraProblem(points, tuple(grids))
     fit, rows = _solve(used, problem, LensState(tuple(lenses), T_cam_cam0, T_cam0_board), dropped, robust)
@@ -115,8 +115,8 @@ def _all_views(problem: CameraProblem, fit: LensFit, rows: list[NDArray[np.int64
     for grid, part, kept in zip(problem.cameras, fit.problem.cameras, rows, strict=True):
         T_cam0_board[grid.instant[kept]] = fit.state.T_cam0_board[part.instant]
         known[grid.instant[kept]] = True
-    grids = [_rows(grid, ~known[grid.instant]) for grid in problem.cameras]
-    lost = _renumber(grids)
+    grids = [rows_of(grid, ~known[grid.instant]) for grid in problem.cameras]
+    lost = renumber(grids)
     poses = [robust_poses_of_views(grid, lens, problem.points) for grid, lens in zip(grids, fit.state.lenses, strict=True)]
     start = board_poses([g.instant for g in grids], fit.state.T_cam_cam0, [p.T_cam_board for p in poses], [p.error for p in poses])
     per_px = float(np.median(np.concatenate([grid.weight[grid.weight > 0] for grid in problem.cameras])))
@@ -148,8 +148,8 @@ def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None
 
 def part_of(fit: LensFit, frames: Sequence[Mask]) -> tuple[CameraProblem, LensState]:
     """Return the problem and the state of some of the views of each camera."""
-    grids = [_rows(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
-    kept = _renumber(grids)
+    grids = [rows_of(grid, rows) for grid, rows in zip(fit.problem.cameras, frames, strict=True)]
+    kept = renumber(grids)
     return replace(fit.problem, cameras=tuple(grids)), replace(fit.state, T_cam0_board=fit.state.T_cam0_board[kept])
 
 
@@ -162,11 +162,12 @@ def instant_times(fit: LensFit) -> Array:
     return (t - t.min()) * 1e-9 if t.any() else np.arange(m, dtype=float)
 
 
-def _rows(grid: CameraViews, rows: Mask) -> CameraViews:
+def rows_of(grid: CameraViews, rows: Mask) -> CameraViews:
+    """Return some of a camera's views."""
     return replace(grid, instant=grid.instant[rows], uv=grid.uv[rows], weight=grid.weight[rows])
 
 
-def _renumber(grids: list[CameraViews]) -> NDArray[np.int64]:
+def renumber(grids: list[CameraViews]) -> NDArray[np.int64]:
     """Close the gaps in the instants' numbers after views were dropped; return the old numbers that stay."""
     kept, renumbered = np.unique(np.concatenate([g.instant for g in grids]), return_inverse=True)
     ends = np.cumsum([len(g.instant) for g in grids])
@@ -189,7 +190,7 @@ def _solve(
             solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x
             good, grids = _judge_views(used, problem, state, found, dropped)
-            state = replace(state, T_cam0_board=state.T_cam0_board[_renumber(grids)])
+            state = replace(state, T_cam0_board=state.T_cam0_board[renumber(grids)])
             problem = replace(problem, cameras=tuple(grids))
             used = [views.select(keep) for views, keep in zip(used, good, strict=True)]
             found = [weight[keep] for weight, keep in zip(found, good, strict=True)]
@@ -253,7 +254,7 @@ def _judge_views(
         good = scale <= _BAD_VIEW * typical
         dropped += [DroppedView(views.camera, views.labels[i], _misfit(scale[i] / typical)) for i in np.flatnonzero(~good)]
         noisier = np.maximum(scale / (_NOISY_VIEW * typical), 1.0)[good]
-        grids.append(replace(_rows(grid, good), weight=found[c][good] / noisier[:, None]))
+        grids.append(replace(rows_of(grid, good), weight=found[c][good] / noisier[:, None]))
         kept.append(good)
     return kept, grids
 

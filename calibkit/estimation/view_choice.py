@@ -1,29 +1,45 @@
-"""Thousands of views say little more than the best few hundred: choose those that add most to the information about the lens."""
+"""Thousands of views say little more than the best few hundred: choose those that add most to what is known of lenses and rig."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from calibkit.data.observations import BoardViews
-from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState
-from calibkit.estimation.lens_fit import MIN_CORNERS, dense_views
+from calibkit.estimation.camera_problem import CameraProblem, LensState
+from calibkit.estimation.camera_rig_seed import Instants, seed_rig
+from calibkit.estimation.lens_fit import MIN_CORNERS, dense_views, renumber, rows_of
 from calibkit.estimation.lens_seed import seed_camera
 from calibkit.geometry.so3 import Array
 
 _FIRST = 20
+_FAR = 4.0  # a seed's pose that fits so many times worse than usual tells nothing
 
 
-def choose_views(views: BoardViews, model: str, most: int) -> BoardViews:
-    """Return at most `most` views: greedily those that raise log det of the information S = sum_f S_f about the lens."""
-    if views.n_frames <= most:
-        return views
-    enough = np.bincount(views.frame, minlength=views.n_frames) >= MIN_CORNERS
-    views = views.select(enough)
-    grid = dense_views(views, model, np.arange(views.n_frames))
-    lens, poses = seed_camera(grid, views.board.points)
-    good = np.flatnonzero(np.isfinite(poses.error) & (poses.error <= 4 * np.median(poses.error[np.isfinite(poses.error)])))
-    part = CameraViews(grid.model, np.arange(len(good)), grid.uv[good], grid.weight[good], grid.image_size)
-    state = LensState((lens,), np.eye(4)[None], poses.T_cam_board[good])
-    S, _ = CameraProblem(views.board.points, (part,)).information(state)
-    return views.select(good[greedy_log_det(S, most)])
+def choose_views(cameras: Sequence[BoardViews], models: Sequence[str], instants: Instants, most: int) -> tuple[list[BoardViews], Instants]:
+    """Return the views of at most `most` instants of cameras that share some, greedily those that raise log det of S = sum_i S_i most.
+
+    S is about the lenses and the camera positions together, so instants that cameras share count for both.
+    """
+    if max(views.n_frames for views in cameras) <= most:
+        return list(cameras), instants
+    grids, lenses, poses, errors, rows = [], [], [], [], []
+    for views, model, instant in zip(cameras, models, instants, strict=True):
+        enough = np.bincount(views.frame, minlength=views.n_frames) >= MIN_CORNERS
+        grid = rows_of(dense_views(views, model, instant), enough)
+        lens, seeds = seed_camera(grid, views.board.points)
+        good = np.isfinite(seeds.error) & (seeds.error <= _FAR * np.median(seeds.error[np.isfinite(seeds.error)]))
+        grids.append(rows_of(grid, good))
+        lenses.append(lens)
+        poses.append(seeds.T_cam_board[good])
+        errors.append(seeds.error[good])
+        rows.append(np.flatnonzero(enough)[good])
+    renumber(grids)
+    T_cam_cam0, T_cam0_board = seed_rig(tuple(grid.instant for grid in grids), poses, errors)
+    S, _ = CameraProblem(cameras[0].board.points, tuple(grids)).information(LensState(tuple(lenses), T_cam_cam0, T_cam0_board))
+    chosen = greedy_log_det(S, most)
+    rows = [row[np.isin(grid.instant, chosen)] for row, grid in zip(rows, grids, strict=True)]
+    views_chosen = [views.select(row) for views, row in zip(cameras, rows, strict=True)]
+    return views_chosen, tuple(instant[row] for instant, row in zip(instants, rows, strict=True))
 
 
 def greedy_log_det(S: Array, most: int) -> Array:

@@ -1,6 +1,7 @@
 """Arguments that would destroy an input or name nothing are refused in one line, and what they name stays as it is."""
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -62,3 +63,25 @@ def test_an_error_of_the_system_comes_with_a_remedy(refused) -> None:
     assert "File name too long" in told
     assert "check the path, its permissions" in told
     assert "Errno" not in told
+
+
+def test_an_output_whose_name_is_no_utf_8_is_refused_before_the_work(refused, tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("")
+    assert "the name is not UTF-8; give another name" in refused("info", tmp_path / "a", "--json", tmp_path / "j\udcff.json")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "latin-1"])
+def test_a_log_without_greek_letters_is_no_error(encoding: str) -> None:
+    program = "from calibkit.cli import main; main.app.command('say')(lambda: print('\u2264 \u03c3')); main.main()"
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", program, "say"], capture_output=True, env=environment, check=False)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, b"? ?", b"")
+
+
+def test_h_is_help_everywhere(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["-h"], ["info", "-h"], ["target", "aprilgrid", "-h"]):
+        monkeypatch.setattr(sys, "argv", ["calibkit", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 0
+        assert "--help" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import os
 import sys
 import traceback
 from importlib import import_module
+from io import TextIOWrapper
 from typing import Annotated
 
 import typer
@@ -22,6 +23,7 @@ app = typer.Typer(
     help="Find the hidden unknowns of a sensor rig and say how far each may be trusted.",
     epilog="--version and --debug may stand anywhere on the line.",
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: importing rich would double the time of --help
 )
@@ -51,6 +53,9 @@ def main() -> None:
     # Our matrices are small and many: BLAS's own threads only get in each other's way. Read when numpy is first imported.
     for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or a log that has no sign for sigma is no error
     arguments = sys.argv[1:]
     try:
         if "" in arguments:

@@ -57,6 +57,8 @@ def refuse_unwritable(path: Path, overwrite: bool) -> None:
     """Raise BadInputError where `path` could not be written: to be asked before long work."""
     if str(path) == "-":
         raise BadInputError("-: output goes to files only; give the name of a file")
+    if any("\ud800" <= character <= "\udfff" for character in path.name):  # bytes that are no UTF-8: YAML and JSON cannot name the file
+        raise BadInputError(f"{one_line(path)}: the name is not UTF-8; give another name")
     refuse_existing(path, overwrite)
     _refuse_no_folder(path)
     try:

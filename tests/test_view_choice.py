@@ -1,15 +1,17 @@
 """Views chosen for information: fewer of them, nearly as much known; and advice that keeps its promise."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
-from lens_samples import T_CAM1_CAM0, rig_views
+from lens_samples import LENSES, T_CAM1_CAM0, rig_views
 
 from calibkit.data.observations import BoardViews
 from calibkit.estimation.camera_rig_seed import match_instants
 from calibkit.estimation.lens_fit import LensFit, fit_lenses
 from calibkit.estimation.lens_trust import lens_covariance
-from calibkit.estimation.view_advice import best_view, region_of
+from calibkit.estimation.lens_verdict import judge_lens
+from calibkit.estimation.view_advice import best_view, region_of, seen_regions
 from calibkit.estimation.view_choice import choose_views, greedy_log_det
 from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid
@@ -84,6 +86,36 @@ def test_the_advised_views_lower_sigma_as_promised() -> None:
     real = np.sqrt(after.plain[0, 0] / covariance.plain[0, 0])
     assert advice.sigma_ratio < real * 1.2  # the advised view is no worse than ten chance ones
     assert advice.sigma_ratio < 0.8
+
+
+def test_advice_names_no_place_outside_the_image_circle() -> None:
+    """The circle of a fisheye leaves the image's corners and sides dark; its rim alone reaches into the ninths there."""
+    camera = LENSES["pinhole-equi"]
+    camera = replace(camera, params=camera.params * [0.62, 0.62, 1, 1, 1, 1, 1, 1])
+    board, rng = AprilGrid(4, 4, 0.13, 0.3), np.random.default_rng(3)
+    poses = random_board_poses(camera, board, 80, rng, max_tilt=0.6, fill=(0.1, 0.3))
+    off_axis = np.arctan2(np.linalg.norm(poses[:, :2, 3], axis=1), poses[:, 2, 3])
+    views, _ = views_of_poses(camera, board, poses[off_axis < 0.6], rng)  # nothing near the rim
+    fit = fit_lenses([views], ["pinhole-equi"], (np.arange(views.n_frames),))
+    covariance = lens_covariance(fit)
+    regions = seen_regions(fit.problem.cameras[0], fit.state.lenses[0])
+    assert set(regions) == {"top", "middle", "bottom"}
+    told = [reason.text for reason in judge_lens(fit, 0, covariance, []).reasons if "of the image" in reason.text]
+    assert told
+    for text in told:
+        assert not re.search(r"\b(left|right) of the image", text), text
+
+
+def test_no_advised_board_is_seen_from_behind() -> None:
+    camera, board, rng = LENSES["pinhole-equi"], AprilGrid(4, 4, 0.13, 0.3), np.random.default_rng(0)
+    fit = fit_lenses(
+        [views_of_poses(camera, board, random_board_poses(camera, board, 20, rng), rng)[0]], ["pinhole-equi"], (np.arange(20),)
+    )
+    covariance = lens_covariance(fit)
+    for weak in np.eye(8):
+        advice = best_view(fit, 0, covariance.plain, weak, covariance.variance_factor)
+        assert advice is not None
+        assert not ("lower" in advice.text and "x axis" in advice.text), advice  # its printed side looks down there, past the camera
 
 
 def test_regions_are_named_as_seen() -> None:

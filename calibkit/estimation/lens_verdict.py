@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict
+from calibkit.estimation.camera_problem import CameraViews
 from calibkit.estimation.lens_fit import LensFit, instant_times
 from calibkit.estimation.lens_trust import PixelEffect, ProjectionSigma, border_scales, orientations, pixel_effect, projection_sigma
 from calibkit.estimation.model_choice import ModelScore
-from calibkit.estimation.view_advice import best_view, region_of
+from calibkit.estimation.view_advice import best_view, region_of, seen_regions
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import FEW_BLOCKS, WEAK, Covariance, grade
 
@@ -53,7 +54,7 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
         return LensJudgement(statuses, (*hopeless, *reasons), projection)
     reasons += _few_looks_reasons(fit, c)
     reasons += _direction_reasons(fit, c, covariance.variance_factor, cov, effect)
-    reasons += _extrapolation_reasons(camera, views.image_size, projection)
+    reasons += _extrapolation_reasons(camera, views, lens, projection)
     return LensJudgement(statuses, tuple(reasons), projection)
 
 
@@ -147,13 +148,14 @@ def _direction_reasons(fit: LensFit, c: int, variance_factor: float, cov: Array,
     return [Reason(verdict, f"{fit.views[c].camera}: {text}")]
 
 
-def _extrapolation_reasons(camera: str, size: tuple[int, int], projection: ProjectionSigma) -> list[Reason]:
-    """Name the part of the image where a point's pixel is not known, and whether a board was there."""
-    sigma = np.where(np.isnan(projection.sigma), -1.0, projection.sigma)
+def _extrapolation_reasons(camera: str, views: CameraViews, lens: Array, projection: ProjectionSigma) -> list[Reason]:
+    """Name the part of the image where a point's pixel is not known, and whether a board was there: a part that the lens sees."""
+    regions = [region_of(uv, views.image_size) for uv in projection.uv]
+    in_view = np.isin(regions, list(seen_regions(views, lens))) & np.isfinite(projection.sigma)
+    sigma = np.where(in_view, projection.sigma, -1.0)
     worst = int(np.argmax(sigma))
     if sigma[worst] <= _EXTRAPOLATED_PX:
         return []
     empty = "" if projection.seen[worst] else " (no board was seen there)"
-    region = region_of(projection.uv[worst], size)
-    text = f"{region} of the image{empty}: a point's pixel is known to {sigma[worst]:.1f} px only; bring the board there"
+    text = f"{regions[worst]} of the image{empty}: a point's pixel is known to {sigma[worst]:.1f} px only; bring the board there"
     return [Reason(Verdict.CHECK, f"{camera}: {text}")]

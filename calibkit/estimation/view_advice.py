@@ -16,6 +16,7 @@ REGIONS = (
     ("lower left", "bottom", "lower right"),
 )
 _TILT = np.deg2rad(40.0)
+_GRAZING = 0.2  # cosine; a board seen from so flat an angle, or from behind, shows no corners
 _TILTS = {
     "facing the camera": (0.0, 0.0),
     "tilted 40 deg about the image's x axis": (_TILT, 0.0),
@@ -37,6 +38,14 @@ def region_of(uv: Array, size: tuple[int, int]) -> str:
     return REGIONS[row][column]
 
 
+def seen_regions(views: CameraViews, lens: Array) -> dict[str, Array]:
+    """Return the ray (3,) of the middle of every ninth of the image that the lens sees: a fisheye's circle may leave the corners out."""
+    width, height = views.image_size
+    centres = np.array([[(i + 0.5) * width / 3, (j + 0.5) * height / 3] for j, i in product(range(3), range(3))]) - 0.5
+    rays, valid = views.model.unproject(centres, lens)
+    return {region_of(centre, views.image_size): ray for centre, ray, ok in zip(centres, rays, valid, strict=True) if ok}
+
+
 def best_view(fit: LensFit, c: int, cov: Array, weak: Array, variance_factor: float) -> Advice | None:
     """Return the view that lowers the variance of weak . lens most, None when no view could be placed.
 
@@ -44,8 +53,6 @@ def best_view(fit: LensFit, c: int, cov: Array, weak: Array, variance_factor: fl
     """
     views, lens = fit.problem.cameras[c], fit.state.lenses[c]
     width, height = views.image_size
-    centres = [np.array([(i + 0.5) * width / 3, (j + 0.5) * height / 3]) for j, i in product(range(3), range(3))]
-    rays, valid = views.model.unproject(np.array(centres), lens)
     distance = float(np.median(np.linalg.norm(fit.state.T_cam0_board[:, :3, 3], axis=-1)))
     usual = np.median(views.weight[views.weight > 0])
     facing = _usual_orientation(fit, c)
@@ -53,10 +60,10 @@ def best_view(fit: LensFit, c: int, cov: Array, weak: Array, variance_factor: fl
     best: Advice | None = None
     prior = np.linalg.pinv(cov, hermitian=True)
     today = float(np.sqrt(weak @ cov @ weak))
-    for (name, tilt), (centre, ray, ok) in product(_TILTS.items(), zip(centres, rays, valid, strict=True)):
-        if not ok:
-            continue
+    for (name, tilt), (region, ray) in product(_TILTS.items(), seen_regions(views, lens).items()):
         R = so3.exp(np.array([*tilt, 0.0])) @ facing
+        if facing[2, 2] * (R[:, 2] @ ray) < _GRAZING:
+            continue
         T = se3.make(R, ray * distance - R @ middle)
         p = views.model.project(se3.transform(T, fit.problem.points), lens)
         inside = p.valid & np.all((p.uv > 0) & (p.uv < np.array([width, height]) - 1.0), axis=-1)
@@ -67,7 +74,7 @@ def best_view(fit: LensFit, c: int, cov: Array, weak: Array, variance_factor: fl
         S, _ = problem.information(LensState((lens,), np.eye(4)[None], T[None]))
         after = float(np.sqrt(weak @ np.linalg.inv(prior + 10 * S[0] / variance_factor) @ weak))
         if best is None or after / today < best.sigma_ratio:
-            best = Advice(f"the board {name}, in the {region_of(centre, views.image_size)} of the image", after / today)
+            best = Advice(f"the board {name}, in the {region} of the image", after / today)
     return best
 
 

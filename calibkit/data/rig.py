@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibkit.data.verdict import Status, Verdict
 from calibkit.geometry import se3, so3
+from calibkit.models import imu
 from calibkit.models.cameras import CAMERAS
 
 VERSION = 1
@@ -40,6 +41,7 @@ Texts = Annotated[list[Text], Field(max_length=1000)]
 Row = Annotated[list[Finite], Field(max_length=400)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Vector4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
+ImuAxis = Literal["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 Matrix4 = Annotated[list[Vector4], Field(min_length=4, max_length=4)]
 
 
@@ -137,14 +139,54 @@ class Camera(Record):
             raise ValueError(f"the camera model '{self.model}' is not known; it may be one of {', '.join(CAMERAS)}")
         if self.parameters.keys() != set(model.parameter_names):
             raise ValueError(f"the parameters of {self.model} are {', '.join(model.parameter_names)}")
-        if self.covariance is not None:
-            strangers = [name for name in self.covariance.order if name not in model.parameter_names]
-            if strangers:
-                raise ValueError(f"covariance.order names '{strangers[0]}', which is no parameter of {self.model}")
-            for i, name in enumerate(self.covariance.order):
-                sigma, variance = self.parameters[name].sigma, self.covariance.matrix[i][i]
-                if sigma is not None and abs(sigma - variance**0.5) > _SIGMA_TOLERANCE * max(sigma, variance**0.5):
-                    raise ValueError(f"the sigma of {name} is {sigma:.6g}, but its covariance says {variance**0.5:.6g}")
+        _same_sigmas(self.parameters, self.covariance)
+        return self
+
+
+def _same_sigmas(parameters: dict[str, Estimate], covariance: Covariance | None) -> None:
+    if covariance is None:
+        return
+    for i, name in enumerate(covariance.order):
+        if name not in parameters:
+            raise ValueError(f"covariance.order names '{name}', which is no parameter here")
+        sigma, variance = parameters[name].sigma, covariance.matrix[i][i]
+        if sigma is not None and abs(sigma - variance**0.5) > _SIGMA_TOLERANCE * max(sigma, variance**0.5):
+            raise ValueError(f"the sigma of {name} is {sigma:.6g}, but its covariance says {variance**0.5:.6g}")
+
+
+class Noise(Record):
+    """One axis' noise: sigma^2(tau) = 3 Q^2 / tau^2 + N^2 / tau + 2 ln 2 / pi B^2 + K^2 tau / 3 + R^2 tau^2 / 2 (IEEE Std 952, annex C).
+
+    Units are of x = rad/s or m/s^2.
+    """
+
+    quantisation: Estimate | None = None  # Q, x s
+    white: Estimate  # N, x / sqrt(Hz)
+    flicker: Estimate  # B, x; the Allan deviation's floor is B sqrt(2 ln 2 / pi) = 0.664 B
+    walk: Estimate  # K, x / s / sqrt(Hz)
+    ramp: Estimate | None = None  # R, x / s
+
+
+class ImuIntrinsics(Record):
+    """Scale, misalignment and bias; `models/imu.py` has the equations, the names of the parameters and the correction in one call."""
+
+    equation: Text = ""
+    correction: Text = ""
+    unit: Literal["SI", "counts"] = "SI"  # of what the IMU measures
+    gravity: Positive  # m/s^2, what the scale hangs on
+    parameters: dict[str, Estimate]
+    covariance: Covariance | None = None
+    verdict: Verdict | None = None
+    reasons: Texts = []
+
+    @model_validator(mode="after")
+    def _as_the_model_has_it(self) -> "ImuIntrinsics":
+        needed = {*imu.ACCEL_PARAMETERS, *imu.GYRO_PARAMETERS}
+        if not needed <= self.parameters.keys() <= set(imu.PARAMETERS):
+            raise ValueError(
+                f"the parameters of an IMU are {', '.join((*imu.ACCEL_PARAMETERS, *imu.GYRO_PARAMETERS))}, and A_g_xx ... A_g_zz"
+            )
+        _same_sigmas(self.parameters, self.covariance)
         return self
 
 
@@ -157,6 +199,10 @@ class Imu(Record):
     gyro_random_walk: Estimate | None = None  # rad/s^2/sqrt(Hz)
     accel_noise_density: Estimate | None = None  # m/s^2/sqrt(Hz)
     accel_random_walk: Estimate | None = None  # m/s^3/sqrt(Hz)
+    noise: dict[ImuAxis, Noise] = {}  # by axis; the four densities above are what an estimator with one value for all axes should take
+    intrinsics: ImuIntrinsics | None = None
+    verdict: Verdict | None = None  # of the noise; None: given, not judged
+    reasons: Texts = []
 
 
 class Transform(Record):

@@ -160,16 +160,17 @@ def _neutral(value: Any) -> bool:
 
 
 def _noise(document: Document, keys: tuple[str, ...]) -> Imu:
-    values = {}
+    values: dict[str, Estimate] = {}
     for key, (field, unit) in NOISE.items():
         value = foreign.number_at(document, (*keys, key))
         if value is not None and value < 0:
             raise document.error((*keys, key), "a noise density is not negative; check it")
-        values[field] = None if value is None else Estimate(value=value, unit=unit)
+        if value is not None:
+            values[field] = Estimate(value=value, unit=unit)
     rate = foreign.number_at(document, (*keys, "update_rate"))
     if rate is not None and rate <= 0:
         raise document.error((*keys, "update_rate"), "a rate is positive; write it in Hz")
-    return Imu(topic=foreign.text_at(document, (*keys, "rostopic")), rate_hz=rate, **values)
+    return Imu(topic=foreign.text_at(document, (*keys, "rostopic")), rate_hz=rate).model_copy(update=values)
 
 
 def _check_names(document: Document, keys: tuple[str, ...], known: tuple[str, ...], warnings: list[str]) -> None:

@@ -63,6 +63,12 @@ def test_order_empty_and_broken_frames(images: list[NDArray[np.uint8]]) -> None:
     assert "bad.png" in views.warnings[0]
 
 
+def test_images_that_cannot_be_read_at_all_are_not_taken_for_a_wrong_board() -> None:
+    broken = [ImageFrame(k, f"im_{k}.png", b"x", undecodable) for k in range(3)]
+    with pytest.raises(BadInputError, match=r"none of 3 images can be read, the first: im_0\.png"):
+        find_boards(broken, BOARD, "cam0", None, silent)
+
+
 def test_the_odd_size_is_named(images: list[NDArray[np.uint8]]) -> None:
     with pytest.raises(BadInputError, match=r"im_3\.png is 200x100, most others are 320x240"):
         find_boards(frames([*images[:3], np.zeros((100, 200), np.uint8), *images[3:]]), BOARD, "cam0", None, silent)

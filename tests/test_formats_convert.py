@@ -106,7 +106,7 @@ def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
         (("export", tmp_path / "rig.yaml", "--to", "vinyl", "-o", out), "--to vinyl: no such format; choose one of kalibr, ros, opencv"),
         (("export", tmp_path / "absent.yaml", "--to", "ros", "-o", out), "absent.yaml: cannot be read"),
         (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "rig.yaml"), "rig.yaml: is a file; give the name of a folder"),
-        (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "a" / "b"), "b: cannot be made"),
+        (("export", tmp_path / "rig.yaml", "--to", "ros", "-o", tmp_path / "rig.yaml" / "b"), "b: cannot be made"),
         (("import", tmp_path / "rig.yaml", "-o", tmp_path / "x.yaml"), "is a rig file already"),
         (("import", out, "-o", tmp_path / "x.yaml"), "out: is not a file"),
         (("import", out / "imu.yaml", out / "imu.yaml", "-o", out / "no" / "x.yaml"), "there is no folder"),
@@ -116,3 +116,15 @@ def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
         assert words in message
         assert message.count("\n") == 1
     assert not (tmp_path / "x.yaml").exists()
+
+
+def test_an_export_never_replaces_the_rig_that_it_comes_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / "camchain.yaml"
+    save_rig(full_rig(), rig)
+    before = rig.read_bytes()
+    assert command(monkeypatch, "export", rig, "--to", "kalibr", "-o", tmp_path, "--force") == 2
+    assert "camchain.yaml: is the rig file that is exported" in capsys.readouterr().err
+    assert rig.read_bytes() == before
+    assert command(monkeypatch, "export", rig, "--to", "kalibr", "-o", tmp_path / "new" / "folder") == 0

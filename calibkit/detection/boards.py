@@ -11,8 +11,6 @@ from calibkit.detection.circlegrid import detect_circlegrid
 from calibkit.detection.found import Detection, Image
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 
-VERSION = 5  # raise it when a detector's answers change: cached corners are then looked for anew
-
 DETECTORS: dict[str, Callable[[Image, Any], Detection]] = {
     AprilGrid.kind: aprilgrid.detect,
     Checkerboard.kind: detect_checkerboard,

@@ -136,7 +136,8 @@ def charuco_board(board: Charuco) -> cv2.aruco.CharucoBoard:
     needed = board.columns * board.rows // 2
     if needed > len(dictionary.bytesList):
         raise BadInputError(
-            f"a ChArUco board of {board.columns} x {board.rows} needs {needed} tags, {name} has {len(dictionary.bytesList)}"
+            f"a ChArUco board of {board.columns} x {board.rows} needs {needed} tags, {name} has {len(dictionary.bytesList)}: "
+            "use fewer squares or a dictionary of more"
         )
     made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_size, board.marker_size, dictionary)
     made.setLegacyPattern(board.legacy)

@@ -10,6 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibkit.data.observations import BoardViews, ImageFrame
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress
 from calibkit.detection.boards import detect
 from calibkit.detection.cache import CornerCache, Entry
@@ -33,6 +34,8 @@ def find_boards(
     """Return the board's corners in every frame that shows it; frames that cannot be decoded are counted and named in the warnings."""
     outcomes = list(progress(_of_one_size(_in_order(frames, board, cache), camera), f"boards in {camera}", total))
     broken = [f"{label}: {result}" for _, label, result in outcomes if isinstance(result, BadInputError)]
+    if broken and len(broken) == len(outcomes):
+        raise BadInputError(f"{camera}: none of {counted(len(broken), 'image')} can be read, the first: {one_line(broken[0], 160)}")
     seen = [(t_ns, label, *result) for t_ns, label, result in outcomes if not isinstance(result, BadInputError)]
     shown = [(t_ns, label, found) for t_ns, label, _, found in seen if len(found.corner)]
     found = [detection for _, _, detection in shown] or [NOTHING]

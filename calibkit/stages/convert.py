@@ -71,6 +71,8 @@ def export_rig(path: Path, to: str, folder: Path, lossy: bool = False, force: bo
     files = {folder / name: text for name, text in exported.files.items()}
     _make_folder(folder)
     for file in files:
+        if file.exists() and file.samefile(path):
+            raise BadInputError(f"{one_line(file)}: is the rig file that is exported; choose another folder")
         refuse_existing(file, force)
     for file, text in files.items():
         write_atomic(file, text, force)
@@ -96,7 +98,7 @@ def _held(name: str, camera: Camera, exporter: Exporter, lossy: bool) -> tuple[C
 
 def _make_folder(folder: Path) -> None:
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise BadInputError(f"{one_line(folder)}: is a file; give the name of a folder") from None
     except (OSError, ValueError) as error:

@@ -56,7 +56,9 @@ def _refuse_absurd(board: Board) -> None:
         low, high = (1e-4, 100) if ratio else (0.005 if name == "tag_size" else 1e-4, 1)
         if not low <= value < high:
             remedy = (
-                "it is in tag sizes, such as 0.3" if ratio else f"lengths are in metres, such as {value / 1000 if value >= 1 else 0.03:g}"
+                "it is in tag sizes, such as 0.3"
+                if ratio
+                else f"lengths are in metres, such as {value / 1000 if 1 <= value < 1000 else 0.03:g}"
             )
             raise BadInputError(f"{name.replace('_', ' ')} of {value:g} makes no board: {remedy}")
     if isinstance(board, Charuco) and board.marker_size >= board.square_size:

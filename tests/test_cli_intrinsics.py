@@ -239,7 +239,7 @@ MISTAKES = {
     "a name that is none": (["corners.csv", "--camera", "0=corners"], "--camera 0=corners"),
     "one name for two": (["corners.csv", "--camera", "a=corners", "--camera", "a=corners"], "--camera a=corners"),
     "an unknown model": (["corners.csv", "--model", "pinhole-magic"], "--model pinhole-magic is not known: choose auto, pinhole-radtan"),
-    "more models than cameras": (["corners.csv", "--model", "kb4", "--model", "pinhole-radtan"], "--model is given 2 times for 1 cameras"),
+    "more models than cameras": (["corners.csv", "--model", "kb4", "--model", "pinhole-radtan"], "--model is given 2 times for 1 camera:"),
     "no size": (["corners.csv"], "add --resolution WIDTHxHEIGHT"),
     "half a size": (["corners.csv", "--resolution", "480"], "--resolution 480: write WIDTHxHEIGHT"),
     "a size with a sign": (["corners.csv", "--resolution", "480x-320"], "--resolution 480x-320"),
@@ -269,7 +269,7 @@ def test_another_board_than_the_one_in_the_images(tmp_path, rendered, target, ru
     for path in sorted(rendered.iterdir())[:1]:
         shutil.copy(path, few)
     line = run(few, "--target", target, "-o", tmp_path / "rig.yaml").mistake
-    assert "no checkerboard 9 x 6 found in 1 images: check the target file against the board" in line
+    assert "no checkerboard 9 x 6 found in 1 image: check the target file against the board" in line
     assert not (tmp_path / "rig.yaml").exists()
 
 

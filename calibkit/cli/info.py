@@ -44,7 +44,7 @@ def _show(result: "Info") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from calibkit.estimation.doctor import counted
+    from calibkit.data.plural import counted
 
     console = Console(highlight=False)
     if not console.is_terminal:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.data.plural import counted
 from calibkit.geometry import so3
 
 Array = NDArray[np.float64]
@@ -33,11 +34,6 @@ class Finding:
     code: str
     problem: bool  # False: a note
     text: str
-
-
-def counted(n: int, one: str, many: str) -> str:
-    """Return how many there are, in the words for one or for many."""
-    return f"{n} {one if n == 1 else many}"
 
 
 def rate_hz(t_ns: Times) -> float | None:
@@ -94,7 +90,13 @@ def check_headers(header_ns: Times, record_ns: Times) -> list[Finding]:
     found = []
     zeros = int(np.sum(header_ns == 0))
     if zeros:
-        found.append(Finding("zero_stamp", True, f"{zeros} of {len(header_ns)} header stamps are zero: record times are used for them"))
+        found.append(
+            Finding(
+                "zero_stamp",
+                True,
+                f"{zeros} of {counted(len(header_ns), 'header stamp')} {'is' if zeros == 1 else 'are'} zero: record times are used instead",
+            )
+        )
     latency = latency_s(header_ns, record_ns)
     if latency is None:
         return found
@@ -198,7 +200,7 @@ def check_saturation(name: str, values: Array) -> list[Finding]:
     if not len(values):
         return []
     ends = [(axis, column, top) for axis, column in zip("xyz", values.T, strict=True) for top in (column.min(), column.max())]
-    clipped = [f"{axis} at {top:.6g} ({count} samples)" for axis, column, top in ends if (count := _clipped(column, top))]
+    clipped = [f"{axis} at {top:.6g} ({counted(count, 'sample')})" for axis, column, top in ends if (count := _clipped(column, top))]
     return [Finding("saturation", True, f"{name} is clipped: {', '.join(clipped)}")] if clipped else []
 
 
@@ -231,19 +233,20 @@ def brightness(gray: NDArray[np.generic]) -> float:
     return float(gray.mean()) / top
 
 
+def _sampled(n: int, sample: Array) -> str:
+    return f"{n} of {counted(len(sample), 'sampled image')} {'is' if n == 1 else 'are'}"
+
+
 def check_images(bright: Array, sharp: Array) -> list[Finding]:
     """Find dark, overexposed and blurred images in a sample (brightness and sharpness of each)."""
     found = []
-    dark, blown, blurred = np.sum(bright < _DARK), np.sum(bright > 1 - _DARK), np.sum(sharp < _BLURRED * np.quantile(sharp, 0.9))
+    dark, blown = int(np.sum(bright < _DARK)), int(np.sum(bright > 1 - _DARK))
+    blurred = int(np.sum(sharp < _BLURRED * np.quantile(sharp, 0.9)))
     if dark:
-        found.append(
-            Finding(
-                "dark", bool(dark > len(bright) / 2), f"{dark} of {len(bright)} sampled images are dark (mean below {100 * _DARK:.0f} %)"
-            )
-        )
+        found.append(Finding("dark", bool(dark > len(bright) / 2), f"{_sampled(dark, bright)} dark (mean below {100 * _DARK:.0f} %)"))
     if blown:
-        found.append(Finding("overexposed", bool(blown > len(bright) / 2), f"{blown} of {len(bright)} sampled images are overexposed"))
+        found.append(Finding("overexposed", bool(blown > len(bright) / 2), f"{_sampled(blown, bright)} overexposed"))
     if blurred:
-        text = f"{blurred} of {len(sharp)} sampled images are blurred, by the measure of the sharpest"
+        text = f"{_sampled(blurred, sharp)} blurred, by the measure of the sharpest"
         found.append(Finding("blur", bool(blurred > len(sharp) / 3), text))
     return found

@@ -130,7 +130,9 @@ def _frame_reasons(fit: LensFit, c: int) -> list[Reason]:
     if len(bad) <= _DROPPED_FRAMES * total:
         return []
     named = "; ".join(f"{view.label}: {view.why}" for view in bad[:3]) + ("; ..." if len(bad) > 3 else "")
-    return [Reason(Verdict.CHECK, f"{camera}: {len(bad)} of {total} views were given up ({named})")]
+    return [
+        Reason(Verdict.CHECK, f"{camera}: {len(bad)} of {counted(total, 'view')} {'was' if len(bad) == 1 else 'were'} given up ({named})")
+    ]
 
 
 def _direction_reasons(fit: LensFit, c: int, variance_factor: float, cov: Array, effect: PixelEffect) -> list[Reason]:

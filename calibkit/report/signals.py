@@ -9,6 +9,7 @@ from math import inf, isfinite
 
 import numpy as np
 
+from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
 from calibkit.report.view import Array, View, given, rms
@@ -113,7 +114,7 @@ def _held_out(view: View) -> Measured:
 def _dropped(view: View) -> Measured:
     total = len(view.raw) + view.n_lost
     dropped = total - int(view.kept.sum())
-    return Measured(100 * dropped / total, f"{dropped} of {total} corners")
+    return Measured(100 * dropped / total, f"{dropped} of {counted(total, 'corner')}")
 
 
 def _worst_frame(view: View) -> Measured:
@@ -148,7 +149,7 @@ def _swirl(view: View) -> Measured:
 def _neighbours(view: View) -> Measured:
     rho, pairs = neighbour_correlation(view)
     chance = abs(rho) * np.sqrt(2 * pairs) < SIGNIFICANT
-    return Measured(rho, f"{pairs} pairs{', chance' if chance else ''}", exempt=bool(chance))
+    return Measured(rho, f"{counted(pairs, 'pair')}{', chance' if chance else ''}", exempt=bool(chance))
 
 
 def _coverage(view: View) -> Measured:

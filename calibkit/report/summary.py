@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
+from calibkit.data.plural import counted
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig
 from calibkit.data.verdict import Reason, Verdict, worst
@@ -80,7 +81,8 @@ def camera_lines(summary: Summary) -> list[str]:
         if r is not None:
             held_out = "" if r.held_out_rms_px is None else f", held-out {r.held_out_rms_px:.3g} px"
             text += _seen(summary, name)
-            text += f"; {r.frames} frames used, {r.frames_dropped} given up; {r.corners} corners kept, {r.corners_dropped} dropped"
+            text += f"; {counted(r.frames, 'frame')} used, {r.frames_dropped} given up"
+            text += f"; {counted(r.corners, 'corner')} kept, {r.corners_dropped} dropped"
             text += f"; rms {r.rms_px:.3g} px ({r.rms_all_px:.3g} px with the dropped){held_out}"
         lines.append(one_line(text))
         lines += [f"  {text}" for text in _pixel_sigma(summary, name)]
@@ -94,7 +96,7 @@ def _seen(summary: Summary, camera: str) -> str:
         views = result.facts.get("views")
         counts = views.get(camera) if isinstance(views, Mapping) else None
         if isinstance(counts, Mapping) and counts.get("images"):
-            return f"; the board is in {counts.get('with_board')} of {counts['images']} images"
+            return f"; the board is in {counts.get('with_board')} of {counted(counts['images'], 'image')}"
     return ""
 
 

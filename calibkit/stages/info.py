@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.observations import ImageFrame, ImuSamples
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation import doctor
@@ -158,7 +159,7 @@ class _ImageJudge:
         """Return what is wrong with the images."""
         findings, sizes, broken = [], self._sizes, self._broken
         if broken:
-            text = f"{len(broken)} of {len(broken) + len(sizes)} sampled images cannot be read; the first: {broken[0]}"
+            text = f"{len(broken)} of {counted(len(broken) + len(sizes), 'sampled image')} cannot be read; the first: {broken[0]}"
             findings.append(Finding("unreadable", True, text))
         if len(set(sizes)) > 1:
             listed = ", ".join(f"{width} x {height} ({bits} bit)" for width, height, bits in sorted(set(sizes))[:4])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calibkit.data.observations import BoardViews
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.data.result import Result, Thumbnail
 from calibkit.detection.cache import CornerCache
@@ -91,7 +92,7 @@ def name_cameras(recording: Recording, asked: Sequence[str]) -> dict[str, str]:
 def _models(asked: Sequence[str], cameras: int) -> list[str | None]:
     """Return the model of each camera, None for one to be chosen."""
     if len(asked) not in (1, cameras):
-        raise BadInputError(f"--model is given {len(asked)} times for {cameras} cameras: give it once for all, or once for each")
+        raise BadInputError(f"--model is given {len(asked)} times for {counted(cameras, 'camera')}: give it once for all, or once for each")
     models: list[str | None] = []
     for name in asked:
         known = ALIASES.get(name, name)
@@ -118,7 +119,7 @@ def _observe_one(
     else:
         views = find_boards(recording.images(topic), board, name, cache, progress, info.count)
     if not views.n_frames:
-        looked = f"{views.n_images} images" if info.kind == "image" else "its corner file"
+        looked = counted(views.n_images, "image") if info.kind == "image" else "its corner file"
         rows, columns = board.shape
         raise BadInputError(
             f"{one_line(topic)}: no {board.kind} {columns} x {rows} found in {looked}: "

@@ -95,8 +95,10 @@ def _result(requests: Sequence[CameraRequest], groups: list[list[int]], solved: 
     for group in groups[1:]:
         names = ", ".join(requests[c].views.camera for c in group)
         first = requests[groups[0][0]].views.camera
+        never = "never sees" if len(group) == 1 else "never see"
         text = (
-            f"{names}: never sees the board at the same moment as {first}, so the transform between them is not known; show both the board"
+            f"{names}: {never} the board at the same moment as {first}, so the transform between them is not known; "
+            "hold the board where both see it at once, with stamps of one clock"
         )
         reasons.append(Reason(Verdict.CHECK, text))
     order = {request.views.camera: i for i, request in enumerate(requests)}

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibkit.detection.boards import detect
-from calibkit.detection.plane_maps import local_maps
+from calibkit.detection.plane_maps import in_line, local_maps
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState
 from calibkit.geometry import se3
 from calibkit.models.board import AprilGrid, Board, Checkerboard, CircleGrid
@@ -39,6 +39,18 @@ def test_local_maps_bend_as_the_lens_and_the_perspective_do(board: Board, most: 
         maps, _ = local_maps(X[:, :2] / unit, uv, 1.0)
         errors.append(np.linalg.norm(maps.Q - truth, axis=(1, 2)) / np.linalg.norm(maps.J, axis=(1, 2)))
     assert np.mean(np.concatenate(errors)) < most
+
+
+@pytest.mark.parametrize("corner", [0, 21, 142], ids=["the board's first", "inside", "its last"])
+def test_a_wrong_corner_is_told_at_the_rim_too(corner: int) -> None:
+    (T,) = random_board_poses(CAMERA, GRID, 1, np.random.default_rng(1), max_tilt=np.deg2rad(40), fill=(0.5, 0.6))
+    uv = project(T, GRID.points)
+    maps, _ = local_maps(GRID.points[:, :2] / GRID.tag_size, uv, 1.0)
+    side = np.sqrt(np.abs(np.linalg.det(maps.J)))
+    uv[corner] += 0.25 * side[corner]
+    _, misfit = local_maps(GRID.points[:, :2] / GRID.tag_size, uv, 1.0)
+    assert misfit.argmax() == corner
+    assert not in_line(misfit, 0.05 * side)[corner]
 
 
 def mean_error(style: RenderStyle, light: float) -> Array:

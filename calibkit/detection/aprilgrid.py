@@ -25,6 +25,7 @@ _BRIGHT = np.array([-1.0, 1.0, -1.0, 1.0])  # x y is negative where it is white 
 _REACH = 1.0  # tag sides over which neighbours tell how a lens bends
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
+_STARTS = 8  # seeds whose homographies are tried: enough that some are right
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
 
 
@@ -68,9 +69,11 @@ def _largest_agreement(xy: Array, corners: Array) -> Mask:
     """Return the most tags (n,) that the homography of some two neighbouring tags foretells, all four corners of each."""
     n = len(xy)
     centre = xy.mean(1)
-    apart = np.linalg.norm(centre[:, None] - centre, axis=-1) + np.diag(np.full(n, np.inf))
+    some = np.unique(np.linspace(0, n - 1, min(n, _STARTS)).astype(int))
+    apart = np.linalg.norm(centre[some, None] - centre, axis=-1)
+    apart[np.arange(len(some)), some] = np.inf
     partner = np.argsort(apart, axis=1)[:, : min(3, n - 1)]
-    first = np.repeat(np.arange(n), partner.shape[1])
+    first = np.repeat(some, partner.shape[1])
     pair = np.zeros((len(first), n))
     pair[np.arange(len(first)), first] = pair[np.arange(len(first)), partner.ravel()] = 1
     H = homographies(xy.reshape(-1, 2), corners.reshape(-1, 2), np.repeat(pair, 4, axis=1))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.detection.found import Image
-from calibkit.detection.plane_maps import LocalMaps
+from calibkit.detection.plane_maps import LocalMaps, centred, middling
 from calibkit.opencv import cv2
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
     sigma = _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok)
     if ok.any():
-        ok &= sigma < _MUCH_WORSE * np.median(sigma[ok])
+        ok &= sigma < _MUCH_WORSE * middling(sigma[ok])
     return CornerFit(uv - _drawn_by_blur(maps), sigma, ok)
 
 
@@ -163,8 +163,7 @@ def _light_slope(uv: Array, level: Array) -> Array:
 
     A slope breaks the symmetry: it draws corners by some 0.004 px, along the edges and with the sign of the pattern.
     """
-    middle, spread = uv.mean(0), uv.std() + 1
-    d = (uv - middle) / spread
+    d, _, spread = centred(uv)
     terms = np.stack([np.ones(len(d)), *d.T, d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2], axis=1)
     _, x, y, xx, xy, yy = np.linalg.solve(terms.T @ terms + _LIGHT_STIFF, terms.T @ level)
     rise = np.stack([x + 2 * xx * d[:, 0] + xy * d[:, 1], y + xy * d[:, 0] + 2 * yy * d[:, 1]], axis=-1)
@@ -204,7 +203,7 @@ def _sigma(variance: Array, gain: Array, metric: Array, ok: NDArray[np.bool_]) -
 
     Samples at a distance r share exp(-r^2 / 4 s^2) of their noise, s the smoothing; `metric` is J^T J of the window.
     """
-    typical = np.median(variance[ok]) if ok.any() else 0.0
+    typical = middling(variance[ok]) if ok.any() else 0.0
     noise = 0.5 * (variance + typical)
     shape = (len(gain), len(_HALF), len(_HALF))
     decay = np.stack([metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]], axis=-1).astype(np.float32) / -(4 * (SMOOTHING_PX**2 + 0.15))

@@ -186,7 +186,7 @@ def test_rows_that_are_cut_or_mean_nothing_are_left_out_and_told(tmp_path: Path)
     recording = open_recording([_csv(tmp_path, text)])
     assert recording.imu("s").t_ns.tolist() == [10**9, 3 * 10**9]
     assert any("1 lines have not 7 columns" in w for w in recording.warnings)
-    assert any("1 samples are not finite" in w for w in recording.warnings)
+    assert any("1 sample is not finite" in w for w in recording.warnings)
     recording = open_recording([_csv(tmp_path, "1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 2\n3 0 0 0 0 0 0 1.001\n", "p.txt")])
     np.testing.assert_array_equal(recording.poses("p").q, [[0, 0, 0, 1]])
     assert any("2 poses have no proper rotation" in w for w in recording.warnings)
@@ -198,7 +198,7 @@ def test_rows_that_are_cut_or_mean_nothing_are_left_out_and_told(tmp_path: Path)
         ("", "holds no rows of numbers"),
         ("a,b,c\n1,2,3\n", r"s\.csv is not recognised: wanted are columns"),
         ("1,2,3\n", "not recognised"),
-        ("t,wx,wy,wz,ax,ay,az\n1,1,2,x,4,5,6\n", "columns wx, wy, wz must hold numbers"),
+        ("t,wx,wy,wz,ax,ay,az\n1,1,2,x,4,5,6\n", "columns wx, wy, wz, ax, ay, az must hold numbers"),
         ("t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\ninf,1,2,3,4,5,6\n", "its time column must hold numbers"),
         ("t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\n1e900000,1,2,3,4,5,6\n", "its time column must hold numbers .* too large"),
         ("t,wx,wy,wz,ax,ay,az\n1e999999999,1,2,3,4,5,6\n", "its time column must hold numbers .* too large"),

@@ -5,6 +5,7 @@ Times are int64 nanoseconds of the recording's own clock (SPEC section 1).
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from calibkit.models.board import Board
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
+ImuUnit = Literal["SI", "counts"]
 
 
 def _check(record: str, **arrays: tuple[NDArray[np.generic], tuple[int, ...]]) -> None:
@@ -29,12 +31,26 @@ class ImuSamples:
     """Gyroscope and accelerometer of one IMU, sorted by time or not: as the recording had them."""
 
     t_ns: Times  # (n,)
-    gyro: Array  # (n, 3) rad/s
-    accel: Array  # (n, 3) m/s^2
+    gyro: Array  # (n, 3) rad/s, or counts; (n, 0) where there is no gyroscope
+    accel: Array  # (n, 3) m/s^2, or counts; (n, 0) where there is no accelerometer
+    unit: ImuUnit = "SI"
 
     def __post_init__(self) -> None:
         n = len(self.t_ns)
-        _check("ImuSamples", t_ns=(self.t_ns, (n,)), gyro=(self.gyro, (n, 3)), accel=(self.accel, (n, 3)))
+        axes = {name: 3 if array.shape != (n, 0) else 0 for name, array in (("gyro", self.gyro), ("accel", self.accel))}
+        _check("ImuSamples", t_ns=(self.t_ns, (n,)), gyro=(self.gyro, (n, axes["gyro"])), accel=(self.accel, (n, axes["accel"])))
+
+    @property
+    def has_gyro(self) -> bool:
+        return bool(self.gyro.shape[1] == 3)
+
+    @property
+    def has_accel(self) -> bool:
+        return bool(self.accel.shape[1] == 3)
+
+    def select(self, rows: slice | NDArray[np.generic]) -> "ImuSamples":
+        """Return some of the samples: a slice (views of the arrays), a mask or indices."""
+        return ImuSamples(self.t_ns[rows], self.gyro[rows], self.accel[rows], self.unit)
 
 
 @dataclass(frozen=True)

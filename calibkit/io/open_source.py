@@ -8,22 +8,25 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.io import ros_messages
 from calibkit.io.csv_streams import csv_source
 from calibkit.io.folder import asl_camera, image_folder, is_asl_camera, is_image
+from calibkit.io.imu_options import ImuOptions
+from calibkit.io.imu_text import pair_halves
 from calibkit.io.ros2_folder import METADATA, is_bag_file, open_bag_file, open_folder
 from calibkit.io.ros_bag import bag_source
 from calibkit.io.source import Source
+from calibkit.io.text_table import is_table, stem
 
-_TABLES = (".csv", ".txt", ".tum")
 
-
-def open_sources(paths: list[Path], distro: str | None) -> list[Source]:
+def open_sources(paths: list[Path], distro: str | None, options: ImuOptions) -> list[Source]:
     """Open all paths; folders and CSV files of one name are told apart by the folders that they lie in."""
     absolute = [Path(path).absolute() for path in paths]
-    times = Counter(path.name for path in absolute if path.is_dir() or path.suffix.lower() in _TABLES)
+    times = Counter(path.name for path in absolute if path.is_dir() or is_table(path))
     names = [f"{path.parent.name}/{path.name}" if times[path.name] > 1 else path.name for path in absolute]
-    sources = [source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro)]
+    sources = [
+        source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro, options)
+    ]
     if len(paths) > 1:
         _refuse_repeats(sources)
-    return sources
+    return pair_halves(sources)
 
 
 def _refuse_repeats(sources: list[Source]) -> None:
@@ -36,28 +39,28 @@ def _refuse_repeats(sources: list[Source]) -> None:
         seen |= files
 
 
-def _open(path: Path, name: str, distro: str | None) -> list[Source]:
+def _open(path: Path, name: str, distro: str | None, options: ImuOptions) -> list[Source]:
     try:
         if path.is_dir():
-            return _open_folder(path, name, distro)
+            return _open_folder(path, name, distro, options)
         if not path.is_file():
             what = "is no regular file" if path.exists() else "does not exist"
             raise BadInputError(f"{one_line(path)} {what}: give a recording (.bag, .mcap, .db3, a folder or CSV)")
         if is_bag_file(path):
             container = open_bag_file(path)
-            return [bag_source(name, [path], [container], _distro(getattr(container, "distro", None), distro), [])]
-        if path.suffix.lower() in _TABLES:
-            return [csv_source(path, name.rsplit(".", 1)[0])]
+            return [bag_source(name, [path], [container], _distro(getattr(container, "distro", None), distro), [], options)]
+        if is_table(path):
+            return [csv_source(path, stem(name), options)]
     except OSError as error:
         raise BadInputError(f"{one_line(path)} cannot be read ({one_line(error.strerror)})") from error
     raise BadInputError(f"{name} is no recording that is known: give a .bag, .mcap, .db3, a folder of images, an ASL folder or CSV")
 
 
-def _open_folder(path: Path, name: str, distro: str | None) -> list[Source]:
+def _open_folder(path: Path, name: str, distro: str | None, options: ImuOptions) -> list[Source]:
     entries = sorted(path.iterdir())
     if (path / METADATA).is_file() or any(is_bag_file(entry) for entry in entries):
         files, containers, stated, warnings = open_folder(path)
-        return [bag_source(name, files, containers, _distro(stated, distro), warnings)]
+        return [bag_source(name, files, containers, _distro(stated, distro), warnings, options)]
     if is_asl_camera(path):
         return [asl_camera(path, name)]
     if (path / "mav0").is_dir():
@@ -66,7 +69,7 @@ def _open_folder(path: Path, name: str, distro: str | None) -> list[Source]:
     refused = []
     for entry in entries:
         try:
-            found += _open_entry(entry, name)
+            found += _open_entry(entry, name, options)
         except BadInputError as error:
             refused.append(str(error))
     if not found:
@@ -77,15 +80,15 @@ def _open_folder(path: Path, name: str, distro: str | None) -> list[Source]:
     return found
 
 
-def _open_entry(entry: Path, name: str) -> list[Source]:
+def _open_entry(entry: Path, name: str, options: ImuOptions) -> list[Source]:
     """Open what lies in a folder of several streams: a sensor's folder of ASL, a folder of images, CSV; nothing else."""
-    topic = one_line(entry.stem, 120)
+    topic = one_line(stem(entry.name), 120)
     table = entry / "data.csv" if entry.is_dir() else entry
     if entry.is_dir() and is_asl_camera(entry):
         return [asl_camera(entry, topic)]
     if entry.is_dir() and any(map(is_image, entry.iterdir())):
         return [image_folder(entry, f"{name}/{topic}")]
-    return [csv_source(table, topic)] if table.suffix.lower() in _TABLES and table.is_file() else []
+    return [csv_source(table, topic, options)] if is_table(table) and table.is_file() else []
 
 
 def _distro(stated: str | None, asked: str | None) -> str | None:

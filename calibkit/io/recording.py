@@ -4,7 +4,7 @@ Nothing is read before it is asked for; what had to be mended is told in `warnin
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -16,12 +16,13 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import ros_messages, tf_tree
 from calibkit.io.board_corners import board_views
+from calibkit.io.imu_options import ImuOptions
 from calibkit.io.open_source import open_sources
 from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo
 from calibkit.models.board import Board
 
 T = TypeVar("T")
-_OPTIONS = {"image": "--camera", "corners": "--camera"}  # that choose a topic of this kind
+_OPTIONS = {"image": "--camera", "corners": "--camera", "imu": "--imu"}  # that choose a topic of this kind
 
 
 class Recording:
@@ -78,9 +79,18 @@ class Recording:
         readers = self._readers("image", topic, (source.images for source in self._sources))
         return (frame for read in readers for frame in read())
 
-    def imu(self, topic: str) -> ImuSamples:
-        """Return all samples of an IMU."""
-        return _join_imu([read() for read in self._readers("imu", topic, (source.imu for source in self._sources))])
+    def imu(self, topic: str, progress: Progress = silent, *, counts: bool = False, partial: bool = False) -> ImuSamples:
+        """Return all samples of an IMU; raw counts, and a gyroscope or an accelerometer alone, only for those who can use them."""
+        readers = self._readers("imu", topic, (source.imu for source in self._sources))
+        samples = _join_imu([read(progress) for read in readers], topic)
+        if samples.unit == "counts" and not counts:
+            raise BadInputError(
+                f"{self.name}: {topic} holds raw counts: state what they are in (--gyro-unit, --accel-unit), or give SI units"
+            )
+        if not partial and not (samples.has_gyro and samples.has_accel):
+            missing = "gyroscope" if samples.has_accel else "accelerometer"
+            raise BadInputError(f"{self.name}: {topic} has no {missing}: give a recording with both, or the other file beside it")
+        return samples
 
     def poses(self, topic: str) -> PoseSamples:
         """Return all poses of a topic."""
@@ -111,13 +121,13 @@ class Recording:
         for source in self._sources:
             for name, stamps in (source.survey(progress, looks or {}) if source.survey else {}).items():
                 parts.setdefault(name, []).append(stamps)
-        return {name: _join_stamps(found) for name, found in parts.items()}
+        return {name: _join_stamps(found, name) for name, found in parts.items()}
 
     def inputs(self) -> list[tuple[str, str | None]]:
         """Return name and SHA-256 of every source; of a folder, the hash of its files' hashes in order."""
         return [(source.name, _digest(source.files)) for source in self._sources]
 
-    def _readers(self, kind: str, topic: str, tables: Iterable[dict[str, Callable[[], T]]]) -> list[Callable[[], T]]:
+    def _readers(self, kind: str, topic: str, tables: Iterable[dict[str, T]]) -> list[T]:
         found = [table[topic] for table in tables if topic in table]
         if not found:
             self.choose(kind, topic)
@@ -129,17 +139,22 @@ def _join(parts: list[PoseSamples]) -> PoseSamples:
     return PoseSamples(t_ns, q, p, parts[0].parent, parts[0].child)
 
 
-def _join_imu(parts: list[ImuSamples]) -> ImuSamples:
-    return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "gyro", "accel")))
+def _join_imu(parts: list[ImuSamples], topic: str) -> ImuSamples:
+    if len(parts) == 1:
+        return parts[0]  # as it is: hours of samples are not copied for nothing
+    if len({(part.unit, part.has_gyro, part.has_accel) for part in parts}) > 1:
+        raise BadInputError(f"{topic} holds other sensors or units in one file than in another: give one of them")
+    t_ns, gyro, accel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "gyro", "accel"))
+    return ImuSamples(t_ns, gyro, accel, parts[0].unit)
 
 
-def _join_stamps(parts: list[Stamps]) -> Stamps:
+def _join_stamps(parts: list[Stamps], topic: str) -> Stamps:
     headers = [part.header_ns for part in parts if part.header_ns is not None]
     samples = [part.imu for part in parts if part.imu is not None]
     return Stamps(
         np.concatenate(headers) if len(headers) == len(parts) else None,
         np.concatenate([part.record_ns for part in parts]),
-        _join_imu(samples) if samples else None,
+        _join_imu(samples, topic) if samples else None,
     )
 
 
@@ -154,9 +169,9 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(digests) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def open_recording(sources: list[Path], ros_distro: str | None = None) -> Recording:
-    """Open recordings of any kind as one, on one clock; `ros_distro` names the ROS 2 distribution where the files do not."""
+def open_recording(sources: list[Path], ros_distro: str | None = None, imu: ImuOptions = ImuOptions()) -> Recording:
+    """Open recordings of any kind as one, on one clock; what the files do not say is in `ros_distro` (of ROS 2) and `imu`."""
     if not sources:
         raise BadInputError("no recording is given: name a .bag, .mcap, .db3, a folder or a CSV file")
     ros_messages.typestore(ros_distro)  # an unknown name is told before anything is read
-    return Recording(open_sources(sources, ros_distro))
+    return Recording(open_sources(sources, ros_distro, imu))

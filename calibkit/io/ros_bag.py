@@ -14,6 +14,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import images, ros_messages
 from calibkit.io.container import Container, Message
+from calibkit.io.imu_options import ImuOptions
 from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo, seconds_text
 from calibkit.io.topic_pass import TopicPass, plausible, restamp
 from calibkit.io.unpack import UnpackError, unpack_message
@@ -25,10 +26,11 @@ _END_OF_TIME = 2**62  # ns, in 2116: later record times are damage
 class _Bag:
     """All bag files of one recording, read topic by topic."""
 
-    def __init__(self, containers: list[Container], distro: str | None, source: Source) -> None:
+    def __init__(self, containers: list[Container], distro: str | None, source: Source, options: ImuOptions) -> None:
         self.containers = sorted(containers, key=lambda c: c.start_ns)
         self.distro = distro
         self.source = source
+        self.options = options
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics, compressed ones unpacked; count what is lost or missing."""
@@ -80,8 +82,8 @@ class _Bag:
         where = f"{self.source.name}: {message.channel.topic} at {label}"
         return ImageFrame(t_ns, label, message.payload, partial(decode_image, message, where, self.distro))
 
-    def imu(self, topic: str) -> ImuSamples:
-        samples = self._pass({topic: "imu"}, silent, {})[topic].imu
+    def imu(self, topic: str, progress: Progress = silent) -> ImuSamples:
+        samples = self._pass({topic: "imu"}, progress, {})[topic].imu
         assert samples is not None, "a pass reads the samples of every IMU"
         return samples
 
@@ -125,8 +127,8 @@ class _Bag:
     def _pass(self, kinds: Mapping[str, str], progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
         """Read some topics at once, whatever their kinds."""
         headed = {c for container in self.containers for c in container.counts if ros_messages.starts_with_header(c.type)}
-        total = sum(topic.count for topic in self.source.topics)
-        passes = {name: TopicPass(kind) for name, kind in kinds.items()}
+        total = sum(topic.count for topic in self.source.topics if topic.name in kinds)
+        passes = {name: TopicPass(kind, self.options) for name, kind in kinds.items()}
         for message in progress(self.messages(passes.keys()), "reading", total):
             name = message.channel.topic
             if name in looks and len(passes[name]) % looks[name].every == 0:
@@ -181,10 +183,12 @@ def _names(topics: Iterable[str]) -> str:
     return names[0] if len(names) == 1 else f"{len(names)} topics"
 
 
-def bag_source(name: str, files: list[Path], containers: list[Container], distro: str | None, warnings: list[str]) -> Source:
+def bag_source(
+    name: str, files: list[Path], containers: list[Container], distro: str | None, warnings: list[str], options: ImuOptions
+) -> Source:
     """Return the topics of bag files and how to read them; `distro` is the ROS 2 distribution, where known."""
     source = Source(name, files, min((c.start_ns for c in containers), default=0), warnings=list(warnings))
-    bag = _Bag(containers, distro, source)
+    bag = _Bag(containers, distro, source, options)
     counts: Counter[tuple[str, str, str]] = Counter()
     for container in containers:
         for warning in container.warnings:
@@ -209,6 +213,8 @@ def bag_source(name: str, files: list[Path], containers: list[Container], distro
             table, read = readers[kind]
             table[topic] = partial(read, topic)
     source.survey = bag.survey
+    if source.imu and options.rate_hz is not None:
+        source.warn(f"{name}: its messages have stamps, so --rate is not used")
     if any(topic.kind == "tf" for topic in source.topics):
         source.edges = bag.edges
     return source

@@ -99,7 +99,8 @@ class Source:
     start_ns: int = 0  # of the first message, where known without reading all
     topics: list[TopicInfo] = field(default_factory=list)
     images: dict[str, Callable[[], Iterator[ImageFrame]]] = field(default_factory=dict)
-    imu: dict[str, Callable[[], ImuSamples]] = field(default_factory=dict)
+    imu: dict[str, Callable[[Progress], ImuSamples]] = field(default_factory=dict)
+    part: str = ""  # "gyro" or "accel": an IMU's file that holds this sensor only
     poses: dict[str, Callable[[], PoseSamples]] = field(default_factory=dict)
     camera_info: dict[str, Callable[[], CameraInfo]] = field(default_factory=dict)
     corners: dict[str, Callable[[], CornerRows]] = field(default_factory=dict)

@@ -1,5 +1,6 @@
 """What one pass over a bag gathers of a topic while its messages go by: times, and the samples of an IMU."""
 
+from array import array
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from calibkit.data.observations import ImuSamples
 from calibkit.io import ros_messages
 from calibkit.io.container import Message
+from calibkit.io.imu_options import ImuOptions
+from calibkit.io.rows import Rows
 from calibkit.io.source import Array, Stamps
 
 T = TypeVar("T")
@@ -48,13 +51,14 @@ def plausible(values: Array) -> NDArray[np.bool_]:
 class TopicPass:
     """One topic's messages on their way: `kind` is a key of source.USES."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, options: ImuOptions) -> None:
         self.kind = kind
         self.lost = 0  # IMU samples that are damaged, once `stamps` was asked for
-        self._headers: list[int] = []
-        self._records: list[int] = []
+        self._options = options
+        self._headers = array("q")
+        self._records = array("q")
         self._waiting: list[Message] = []
-        self._samples: list[tuple[Array, Array, NDArray[np.bool_]]] = []
+        self._gyro, self._accel, self._whole = Rows((3,), np.float64), Rows((3,), np.float64), Rows((), np.bool_)
 
     def __len__(self) -> int:
         return len(self._records)
@@ -76,19 +80,28 @@ class TopicPass:
 
     def stamps(self) -> Stamps:
         """Return what was gathered."""
-        headers = np.array(self._headers, np.int64) if len(self._headers) == len(self._records) else None
-        return Stamps(headers, np.array(self._records, np.int64), self._imu() if self.kind == "imu" else None)
+        headers = _flat(self._headers) if len(self._headers) == len(self._records) else None
+        return Stamps(headers, _flat(self._records), self._imu() if self.kind == "imu" else None)
 
     def _decode(self) -> None:
         gyro, accel, whole = ros_messages.decode_imu([m.payload for m in self._waiting], self._waiting[0].channel.encoding)
-        self._samples.append((gyro, accel, whole & plausible(gyro) & plausible(accel)))
+        self._whole.add(whole & plausible(gyro) & plausible(accel))
+        self._gyro.add(gyro * self._options.gyro_scale)
+        self._accel.add(accel * self._options.accel_scale)
         self._waiting.clear()
 
     def _imu(self) -> ImuSamples:
         if self._waiting:
             self._decode()
-        nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)
-        gyro, accel, whole = (np.concatenate(parts) for parts in zip(nothing, *self._samples, strict=True))
-        t_ns = np.array([t for t, _ in restamp(zip(self._headers, self._records, self._records, strict=True), [])], np.int64)
+        t_ns = _flat(self._headers)
+        if self.zeros:
+            t_ns = np.array([t for t, _ in restamp(zip(self._headers, self._records, self._records, strict=True), [])], np.int64)
+        gyro, accel, whole = self._gyro.take(), self._accel.take(), self._whole.take()
         self.lost = int(np.sum(~whole))
-        return ImuSamples(t_ns[whole], gyro[whole], accel[whole])
+        if self.lost:
+            t_ns, gyro, accel = t_ns[whole], gyro[whole], accel[whole]
+        return ImuSamples(t_ns, gyro, accel, self._options.unit)
+
+
+def _flat(numbers: "array[int]") -> NDArray[np.int64]:
+    return np.frombuffer(numbers, np.int64) if numbers else np.zeros(0, np.int64)

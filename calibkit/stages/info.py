@@ -120,9 +120,10 @@ def _examine(topic: TopicInfo, stamps: Stamps, images: "_ImageJudge | None") -> 
 
 
 def _imu_findings(samples: ImuSamples) -> list[Finding]:
+    si = samples.unit == "SI"
     return [
-        *doctor.check_accel(samples.accel),
-        *doctor.check_gyro_unit(samples.t_ns, samples.gyro, samples.accel),
+        *(doctor.check_accel(samples.accel) if si and samples.has_accel else []),
+        *(doctor.check_gyro_unit(samples.t_ns, samples.gyro, samples.accel) if si and samples.has_accel and samples.has_gyro else []),
         *doctor.check_saturation("the gyroscope", samples.gyro),
         *doctor.check_saturation("the accelerometer", samples.accel),
         *doctor.check_frozen(np.hstack([samples.gyro, samples.accel])),

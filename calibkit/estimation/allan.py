@@ -1,0 +1,228 @@
+"""Allan deviation and its relatives of rates, at many averaging times and several channels at once.
+
+Every kind is a p-th difference at lag m of cumulative sums. With y the rates less their mean, X[i] = y[0] + .. + y[i-1] and W the
+cumulative sum of X (NIST SP1065, Riley 2008, section 5.2):
+
+    Allan     sigma^2(m tau0) = < (X[i+2m] - 2 X[i+m] + X[i])^2 > / (2 m^2)
+    Hadamard  sigma^2(m tau0) = < (X[i+3m] - 3 X[i+2m] + 3 X[i+m] - X[i])^2 > / (6 m^2)
+    modified  sigma^2(m tau0) = < (W[i+3m] - 3 W[i+2m] + 3 W[i+m] - W[i])^2 > / (2 m^4);  time deviation = tau modified / sqrt 3
+    total     Allan's, over every i of X continued by point reflection at both of its ends
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibkit.errors import BadInputError
+from calibkit.estimation.allan_confidence import interval, noise_exponents
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CONFIDENCE = 0.95
+_BLOCK = 8192  # samples worked on at once: they stay in the cache, and BLAS starts no threads for a dot product below 10 000
+_FINEST = 16  # the decimated mode's stride is at most tau / 16
+_ERROR = 1.5e-4  # the decimated mode's relative error where white noise dominates, one sigma
+_HALVES = 5e-4  # where the even and odd halves of the terms disagree by more, the stride is halved
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Deviations by averaging time and channel, in the unit of the rates (time deviation: times s), with their 95 % interval."""
+
+    kind: str
+    tau: Array  # (k,) s, a whole number of samples each
+    dev: Array  # (k, c)
+    edf: Array  # (k, c) equivalent degrees of freedom
+    lower: Array  # (k, c) chi-squared, 95 % two-sided
+    upper: Array  # (k, c)
+    n: Ints  # (k,) terms that the mean is over; the decimated mode takes some of them
+    alpha: Ints  # (k, c) noise found there, the spectrum of the rates being f^alpha: 0 white, -1 flicker, -2 random walk
+
+
+@dataclass(frozen=True)
+class _Kind:
+    order: int  # p of the p-th difference
+    modified: bool  # of W, not of X
+    divisor: float
+    overlapped: bool = True
+    reflected: bool = False
+    time: bool = False
+
+
+KINDS = {
+    "overlapping": _Kind(2, False, 2.0),
+    "modified": _Kind(3, True, 2.0),
+    "hadamard": _Kind(3, False, 6.0),
+    "adev": _Kind(2, False, 2.0, overlapped=False),
+    "hdev": _Kind(3, False, 6.0, overlapped=False),
+    "tdev": _Kind(3, True, 2.0, time=True),
+    "totdev": _Kind(2, False, 2.0, reflected=True),
+}
+
+
+def octaves(n: int, rate_hz: float) -> Array:
+    """Return the averaging times of 1, 2, 4 .. samples up to a quarter of n samples, in s."""
+    return np.asarray(2.0 ** np.arange(max(n // 4, 1).bit_length()) / rate_hz)
+
+
+def log_spaced(n: int, rate_hz: float, count: int = 100) -> Array:
+    """Return at most `count` averaging times of one sample to a quarter of n samples, evenly spaced in log tau, in s."""
+    return np.asarray(np.unique(np.round(np.geomspace(1, max(n // 4, 1), count))) / rate_hz)
+
+
+def deviation(
+    x: ArrayLike, rate_hz: float, tau: ArrayLike | None = None, kind: str = "overlapping", exact: bool = False, workers: int | None = None
+) -> Deviation:
+    """Return the deviation of rates x (n, c) or (n,) at the averaging times tau (s; `log_spaced` ones when None).
+
+    exact takes every overlapping term. Otherwise long averaging times take every s-th term only, s <= tau / 16 and a power of two: within
+    1e-3 of exact. Averaging times are rounded to whole samples (to multiples of s), and those longer than the recording allows are left
+    out: the result says which. The interval is chi-squared with the equivalent degrees of freedom of the noise found at each averaging time (`allan_confidence`).
+    BadInputError: values that are not finite, too few samples, a rate or averaging time that is not positive, none short enough.
+    ValueError: kind, shape.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"no deviation is named {kind!r}: choose one of {', '.join(KINDS)}")
+    of, x = KINDS[kind], np.asarray(x, np.float64)
+    x = x[:, None] if x.ndim == 1 else x
+    _check(x, rate_hz)
+    n = len(x)
+    m = _lags(log_spaced(n, rate_hz) if tau is None else np.atleast_1d(np.asarray(tau, np.float64)), rate_hz, n, of)
+    strides = np.ones_like(m)
+    if not exact and of.overlapped and not of.reflected:
+        strides = _strides(m, _terms(m, n, of))
+        m = np.round(m / strides).astype(np.int64) * strides
+        keep = (_terms(m, n, of) > 0) & (np.diff(m, prepend=0) > 0)
+        m, strides = m[keep], strides[keep]
+
+    def channel(j: int) -> tuple[Array, Ints]:
+        phase = _cumulative(x[:, j])
+        return _mean_squares(phase, m, strides, of), noise_exponents(phase, m, of.order if not of.modified else 2)
+
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        found = list(pool.map(channel, range(x.shape[1])))
+    seconds, alpha = m / rate_hz, np.stack([a for _, a in found], axis=1)
+    dev = np.sqrt(np.stack([s for s, _ in found], axis=1) / of.divisor) / (m**2 if of.modified else m)[:, None]
+    if of.time:
+        dev *= seconds[:, None] / np.sqrt(3)
+    edf, low, high = interval(of.order - of.modified, of.modified, of.overlapped, of.reflected, m, n + 1, alpha, CONFIDENCE)
+    return Deviation(kind, seconds, dev, edf, dev * low, dev * high, _terms(m, n, of), alpha)
+
+
+def _check(x: Array, rate_hz: float) -> None:
+    if x.ndim != 2 or x.shape[1] == 0:
+        raise ValueError(f"rates have shape {x.shape}, expected (n, channels)")
+    if not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise BadInputError(f"a sampling rate of {rate_hz} Hz is none: give a positive one")
+    if len(x) < 8:
+        raise BadInputError(f"{len(x)} samples are too few for an Allan deviation: record hours, not moments")
+    if not np.isfinite(np.einsum("nc->", x)) and not np.isfinite(x).all():
+        raise BadInputError("the rates hold values that are not finite: remove those samples from the recording")
+
+
+def _lags(tau: Array, rate_hz: float, n: int, of: _Kind) -> Ints:
+    """Return the averaging times as numbers of samples, ascending, each once."""
+    if tau.ndim != 1 or not (np.isfinite(tau).all() and np.all(tau > 0)):
+        raise BadInputError("averaging times are positive numbers of seconds, in one list")
+    # Bounded before it becomes an integer: 1e300 s is longer than any recording.
+    m = np.unique(np.maximum(np.round(np.minimum(tau * rate_hz, 2.0 * n)), 1).astype(np.int64))
+    m = m[_terms(m, n, of) > 0]
+    if len(m) == 0:
+        raise BadInputError(f"every averaging time is too long for {n} samples at {rate_hz:g} Hz ({n / rate_hz:g} s)")
+    return m
+
+
+def _terms(m: Ints, n: int, of: _Kind) -> Ints:
+    """Return how many terms the mean of n samples is over at each lag; 0 or less where there is none."""
+    if of.reflected:
+        return np.where(m < n, n - 1, 0)
+    every = n + 1 + of.modified - of.order * m
+    return every if of.overlapped else -(-every // m)
+
+
+def _strides(m: Ints, terms: Ints) -> Ints:
+    """Return the power of two by which the terms at each lag may be thinned.
+
+    White rates make X a random walk; the mean over every s-th of its squared second differences then has a relative error of
+    s / sqrt(m terms), half of that in the deviation.
+    """
+    most = np.minimum(m / _FINEST, 2 * _ERROR * np.sqrt(m * terms))
+    return np.asarray(2 ** np.floor(np.log2(np.maximum(most, 1))).astype(np.int64))
+
+
+def _cumulative(y: Array) -> Array:
+    """Return the cumulative sum of y less its mean, from 0: what is left of the mean would grow with n and cost digits."""
+    total = np.empty(len(y) + 1)
+    total[0] = 0.0
+    np.subtract(y, y.mean(), out=total[1:])
+    np.cumsum(total, out=total)
+    return total
+
+
+def _mean_squares(phase: Array, m: Ints, strides: Ints, of: _Kind) -> Array:
+    """Return the mean square of the p-th differences of one channel at each lag."""
+    if of.reflected:
+        middle = len(phase) - 2
+        longer = np.concatenate([2 * phase[0] - phase[-2:0:-1], phase, 2 * phase[-1] - phase[-2:0:-1]])
+        return np.array([_squares(longer[middle + 1 - lag : 2 * middle + 1 + lag], [lag], 2).sum() / middle for lag in m.tolist()])
+    series = _cumulative(phase) if of.modified else phase
+    if not of.overlapped:
+        return np.array([np.mean(np.diff(series[::lag], of.order) ** 2) for lag in m.tolist()])
+    result = np.empty(len(m))
+    left, s = strides.copy(), int(strides.max())
+    while s:
+        # From the coarsest stride down: what is not good enough with this one is done again with the next.
+        now = np.flatnonzero(left == s)
+        if len(now):
+            lags = m[now] // s
+            thinned = series if s == 1 else series[::s].copy()
+            squares = _squares(thinned, lags.tolist(), of.order, halves=s > 1)
+            count = len(thinned) - of.order * lags
+            result[now] = squares.sum(axis=1) / count
+            even = squares[:, 0] / ((count + 1) // 2)
+            rough = (np.abs(even - result[now]) > 2 * _HALVES * result[now]) & (s > 1)
+            left[now[rough]] //= 2
+        s //= 2
+    return result
+
+
+def _squares(p: Array, lags: Sequence[int], order: int, halves: bool = False) -> Array:
+    """Return the sums of squares (lags, 2) of the differences of p at ascending lags: of even and odd terms, or of all in the first."""
+    sums, scaled, scratch = np.zeros((len(lags), 2)), order * p, np.empty(_BLOCK)
+    difference = _DIFFERENCES[order]
+    for start in range(0, len(p) - order * lags[0], _BLOCK):
+        for k, lag in enumerate(lags):
+            size = min(_BLOCK, len(p) - order * lag - start)
+            if size <= 0:
+                break
+            d = difference(p, scaled, start, lag, scratch[:size])
+            total = d @ d
+            if halves:
+                even = d[::2] @ d[::2]
+                sums[k] += even, total - even
+            else:
+                sums[k, 0] += total
+    return sums
+
+
+def _second(p: Array, scaled: Array, i: int, m: int, d: Array) -> Array:
+    """Fill d with p[i + 2m] - 2 p[i + m] + p[i], scaled being 2 p."""
+    np.subtract(p[i + 2 * m : i + 2 * m + len(d)], scaled[i + m : i + m + len(d)], out=d)
+    d += p[i : i + len(d)]
+    return d
+
+
+def _third(p: Array, scaled: Array, i: int, m: int, d: Array) -> Array:
+    """Fill d with p[i + 3m] - 3 p[i + 2m] + 3 p[i + m] - p[i], scaled being 3 p."""
+    np.subtract(p[i + 3 * m : i + 3 * m + len(d)], scaled[i + 2 * m : i + 2 * m + len(d)], out=d)
+    d += scaled[i + m : i + m + len(d)]
+    d -= p[i : i + len(d)]
+    return d
+
+
+_DIFFERENCES: dict[int, Callable[[Array, Array, int, int, Array], Array]] = {2: _second, 3: _third}

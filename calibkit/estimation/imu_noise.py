@@ -1,0 +1,237 @@
+"""The noise of a resting IMU: N, B, K (and Q, R where they show) of each axis by maximum likelihood, with honest intervals.
+
+The likelihood is that of the whole recording in the cosine basis (`noise_spectrum`), so every tau counts with its true weight and the
+correlation of the estimates comes with them. A term whose 95 % interval reaches zero gets no number but a limit, and the hours needed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from calibkit.data.verdict import Status
+from calibkit.errors import BadInputError
+from calibkit.estimation.noise_hours import hours_to_resolve
+from calibkit.estimation.noise_interval import Interval, interval
+from calibkit.estimation.noise_likelihood import Fit, Problem, maximise, problem
+from calibkit.estimation.noise_shape import (
+    Feature,
+    Misfit,
+    discrepancy,
+    find_cut,
+    find_lines,
+    goodness,
+    mask,
+    misfits,
+)
+from calibkit.estimation.noise_spectrum import TERMS, Spectrum, spectrum
+
+Array = NDArray[np.float64]
+
+MIN_SAMPLES = 400
+_DETERMINED = 2.0  # upper over lower end of the 95 % interval up to which a term counts as determined
+_TERM_SHOWS = 10.83  # gain of the deviance that Q or R must bring: 99.9 % of chi-squared with 1 degree of freedom
+_MARKOV_SHOWS = 18.0  # and the Gauss-Markov term: 1.2e-4 of chi-squared with 2, its time being searched for
+_MARKOV_CORNER = 4.0  # its corner frequency lies at least this factor below f_max: what is faster is the sensor's filter
+_MARKOV_STEPS = 20
+_AVAR = 2 * np.log(2) / np.pi
+
+
+@dataclass(frozen=True)
+class NoiseTerm:
+    """One coefficient. Not observable: value and sigma are None, and 0 .. upper95 is what the recording leaves possible."""
+
+    value: float | None
+    sigma: float | None
+    lower95: float
+    upper95: float
+    status: Status
+    hours_needed: float | None = None  # not observable: a recording longer than this resolves `resolves`; inf: none of 1000 h does
+    resolves: float | None = None
+
+
+@dataclass(frozen=True)
+class Markov:
+    """A first-order Gauss-Markov process (exponentially correlated noise) beside the five terms."""
+
+    sigma: float  # its standard deviation, x
+    time_s: float  # correlation time
+
+
+@dataclass(frozen=True)
+class AxisNoise:
+    """The noise of one axis in its own units x.
+
+    sigma^2(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2 (IEEE Std 952, annex C).
+    """
+
+    white: NoiseTerm  # N, x / sqrt(Hz)
+    flicker: NoiseTerm  # B, x
+    walk: NoiseTerm  # K, x / s / sqrt(Hz)
+    quantisation: NoiseTerm | None  # Q, x s; None: does not show
+    ramp: NoiseTerm | None  # R, x / s; None: does not show
+    markov: Markov | None
+    best: dict[str, float]  # coefficient of each term at the maximum, also of those that are not observable
+    covariance: Array  # (3, 3) of N, B, K at the maximum
+    f_max: float  # Hz, the highest frequency used
+    features: tuple[Feature, ...]
+    misfit: tuple[Misfit, ...]
+    goodness: float  # probability that a right model fits no better
+    discrepancy: float  # relative error of the model's power beyond chance, allowed for in the intervals
+    reasons: tuple[str, ...]
+
+
+def fit_noise(x: NDArray[np.floating] | Sequence[NDArray[np.floating]], rate_hz: float) -> list[AxisNoise]:
+    """Return the noise of every axis from static rates x (n, c), or from the pieces (n_i, c) that remain of a recording.
+
+    Pieces count as independent. Raises BadInputError where x is not finite or shorter than 400 samples.
+    """
+    pieces = [np.atleast_2d(np.asarray(p).T).T for p in ([x] if isinstance(x, np.ndarray) else x)]
+    pieces = [p for p in pieces if len(p) >= MIN_SAMPLES]
+    if not pieces:
+        raise BadInputError(f"too short for a noise model: no piece of {MIN_SAMPLES} samples at rest; record longer")
+    return [_fit_axis([p[:, axis] for p in pieces], rate_hz) for axis in range(pieces[0].shape[1])]
+
+
+def model_deviation(noise: AxisNoise, tau: Array) -> Array:
+    """Return the fitted model's Allan deviation at tau (s); terms that are not observable count with their likeliest value."""
+    best = noise.best
+    variance = best["white"] ** 2 / tau + _AVAR * best["flicker"] ** 2 + best["walk"] ** 2 * tau / 3
+    variance = variance + 3 * best["quantisation"] ** 2 / tau**2 + best["ramp"] ** 2 * tau**2 / 2
+    if noise.markov is not None:
+        u = tau / noise.markov.time_s
+        variance = variance + 2 * noise.markov.sigma**2 / u * (1 - (3 - 4 * np.exp(-u) + np.exp(-2 * u)) / (2 * u))
+    deviation: Array = np.sqrt(variance)
+    return deviation
+
+
+@dataclass(frozen=True)
+class _Model:
+    terms: tuple[int, ...] = (0, 1, 2)
+    markov_s: float | None = None
+    ramp: bool = False
+
+
+def _fit_axis(pieces: Sequence[NDArray[np.floating]], rate_hz: float) -> AxisNoise:
+    columns = [np.asarray(p, dtype=np.float64) for p in pieces]
+    if not all(np.all(np.isfinite(c)) for c in columns):
+        raise BadInputError("the samples hold NaN or infinity; cut them out first")
+    unit = float(np.sqrt(np.mean(np.concatenate([np.diff(c) ** 2 for c in columns]))))
+    if unit == 0:
+        return _stuck(rate_hz)
+    records = [spectrum((c - c.mean()) / unit, rate_hz) for c in columns]
+    lines = find_lines(max(records, key=lambda r: r.duration_s))
+    f_max, cut = find_cut(records, lines)
+    weights = [r.count * mask(r.f, lines, f_max) for r in records]
+    model, p, fit = _choose(records, weights, f_max)
+    found = misfits(p, fit, records, weights)
+    delta = discrepancy(found)
+    if delta > 0:
+        weights = _damped(records, weights, delta)
+        p = _problem(records, weights, model)
+        fit = maximise(p, fit.theta)
+        found = misfits(p, fit, records, weights)
+    return _axis(records, model, p, fit, unit, f_max, [*lines, *([cut] if cut else [])], found, delta)
+
+
+def _problem(records: Sequence[Spectrum], weights: Sequence[Array], model: _Model) -> Problem:
+    return problem(records, weights, model.terms, model.markov_s, model.ramp)
+
+
+def _choose(records: Sequence[Spectrum], weights: Sequence[Array], f_max: float) -> tuple[_Model, Problem, Fit]:
+    """Return the model: N, B, K, and whatever else the likelihood demands."""
+    model = _Model()
+    p = _problem(records, weights, model)
+    fit = maximise(p)
+    for more in (replace(model, terms=(0, 1, 2, 3)), replace(model, ramp=True)):
+        candidate = replace(more, terms=tuple(sorted({*model.terms, *more.terms})), ramp=model.ramp or more.ramp)
+        trial_p = _problem(records, weights, candidate)
+        trial = maximise(trial_p)
+        if fit.deviance - trial.deviance > _TERM_SHOWS:
+            model, p, fit = candidate, trial_p, trial
+
+    def deviance(log_time: float) -> float:
+        return maximise(_problem(records, weights, replace(model, markov_s=float(np.exp(log_time))))).deviance
+
+    grid = np.linspace(np.log(_MARKOV_CORNER / (2 * np.pi * f_max)), np.log(max(r.duration_s for r in records) / 20), _MARKOV_STEPS)
+    best = int(np.argmin([deviance(t) for t in grid]))
+    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    time = float(np.exp(minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 0.02}).x))
+    candidate = replace(model, markov_s=time)
+    trial_p = _problem(records, weights, candidate)
+    trial = maximise(trial_p)
+    return (candidate, trial_p, trial) if fit.deviance - trial.deviance > _MARKOV_SHOWS else (model, p, fit)
+
+
+def _damped(records: Sequence[Spectrum], weights: Sequence[Array], delta: float) -> list[Array]:
+    """Return weights of a model that is off by delta from half octave to half octave: modes n count as n / (1 + n delta^2 / 2)."""
+    out = []
+    for record, weight in zip(records, weights, strict=True):
+        group = np.floor(2 * np.log2(record.f * 2 * record.duration_s)).astype(int)
+        n = np.bincount(group, weights=weight)
+        out.append(weight / (1 + n[group] * delta**2 / 2))
+    return out
+
+
+def _axis(
+    records: Sequence[Spectrum],
+    model: _Model,
+    p: Problem,
+    fit: Fit,
+    unit: float,
+    f_max: float,
+    features: list[Feature],
+    found: list[Misfit],
+    delta: float,
+) -> AxisNoise:
+    hours = sum(r.duration_s for r in records) / 3600
+    spans = [interval(p, fit, i) for i in range(len(model.terms))]
+    rate_hz = records[0].rate_hz
+    needed = [
+        None if span.resolved else hours_to_resolve(fit.theta, spans, model.terms, i, hours, f_max, rate_hz) for i, span in enumerate(spans)
+    ]
+    terms = {TERMS[term]: _term(span, unit, need) for term, span, need in zip(model.terms, spans, needed, strict=True)}
+    variance = np.linalg.pinv(fit.information)[:3, :3]
+    root = np.sqrt(np.maximum(fit.theta[:3], 1e-30))
+    best = dict.fromkeys((*TERMS, "ramp"), 0.0)
+    best |= {TERMS[t]: float(np.sqrt(fit.theta[i])) * unit for i, t in enumerate(model.terms)}
+    ramp = None
+    if model.ramp:
+        sigma = float(np.sqrt(fit.ramp_variance))
+        best["ramp"] = abs(fit.ramp) * unit
+        low, high = sorted((abs(fit.ramp) - 1.96 * sigma, abs(fit.ramp) + 1.96 * sigma))
+        ramp = _term(Interval(abs(fit.ramp), sigma, max(low, 0.0), high, low > 0), unit, None)
+    markov = Markov(float(np.sqrt(fit.theta[-1])) * unit, model.markov_s) if model.markov_s else None
+    return AxisNoise(
+        white=terms["white"],
+        flicker=terms["flicker"],
+        walk=terms["walk"],
+        quantisation=terms.get("quantisation"),
+        ramp=ramp,
+        markov=markov,
+        best=best,
+        covariance=variance / (4 * root[:, None] * root) * unit**2,
+        f_max=f_max,
+        features=tuple(f.scaled(unit) for f in features),
+        misfit=tuple(found),
+        goodness=goodness(found),
+        discrepancy=delta,
+        reasons=(),
+    )
+
+
+def _term(span: Interval, unit: float, needed: tuple[float, float] | None) -> NoiseTerm:
+    if not span.resolved:
+        hours, resolves = needed if needed is not None else (None, None)
+        return NoiseTerm(None, None, 0.0, span.upper * unit, Status.NOT_OBSERVABLE, hours, None if resolves is None else resolves * unit)
+    status = Status.DETERMINED if span.upper <= _DETERMINED * span.lower else Status.WEAK
+    return NoiseTerm(span.value * unit, span.sigma * unit, span.lower * unit, span.upper * unit, status)
+
+
+def _stuck(rate_hz: float) -> AxisNoise:
+    nothing = NoiseTerm(None, None, 0.0, 0.0, Status.NOT_OBSERVABLE)
+    reason = "every sample has the same value: the axis is stuck, or its noise is below the resolution"
+    best = dict.fromkeys((*TERMS, "ramp"), 0.0)
+    return AxisNoise(nothing, nothing, nothing, None, None, None, best, np.zeros((3, 3)), rate_hz / 2, (), (), 1.0, 0.0, (reason,))

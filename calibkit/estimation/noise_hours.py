@@ -1,0 +1,46 @@
+"""How long a recording must be to resolve a noise term: from the information it would hold, before it is made."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.estimation.noise_interval import Interval
+from calibkit.estimation.noise_likelihood import Problem, maximise
+from calibkit.estimation.noise_spectrum import shapes
+
+Array = NDArray[np.float64]
+
+MOST_HOURS = 1000.0
+_RISE = 10.5  # expected gain of the deviance: (1.96 + 1.28)^2, so that nine of ten such recordings resolve the term
+_PART = 1 / 4  # of the present upper limit: the value that the recording asked for is to resolve
+_STEP = 1.25
+
+
+def hours_to_resolve(
+    theta: Array, spans: Sequence[Interval], terms: Sequence[int], i: int, hours: float, f_max: float, rate_hz: float
+) -> tuple[float, float]:
+    """Return the hours of recording that resolve a coefficient i of a part of its present upper limit, and that value.
+
+    The expected data of such a recording (its power exactly the model's) are fitted without the term (Cowan et al. 2011, the Asimov set);
+    what the deviance loses is the expected test statistic. What else is not resolved is taken to be there in the same part of its limit.
+    Infinite where 1000 h do not do.
+    """
+    limit = np.array([0.0 if span.resolved else (_PART * span.upper) ** 2 for span in spans])
+    truth = np.maximum(theta[: len(terms)], limit)
+    truth[i] = limit[i]
+    value = float(np.sqrt(limit[i]))
+    length = hours
+    while length < MOST_HOURS:
+        length *= _STEP
+        if _expected_rise(truth, terms, i, length * 3600, f_max, rate_hz) > _RISE:
+            return length, value
+    return np.inf, value
+
+
+def _expected_rise(truth: Array, terms: Sequence[int], i: int, duration_s: float, f_max: float, rate_hz: float) -> float:
+    edges = np.unique(np.round(np.geomspace(1, 2 * duration_s * f_max, 80)))
+    count, f = np.diff(edges), (edges[:-1] + edges[1:] - 1) / 2 / (2 * duration_s)
+    shape = shapes(f, rate_hz)[list(terms)]
+    p = Problem(shape, truth @ shape, count, [], [], [])
+    return maximise(p, truth, (i, 0.0)).deviance - maximise(p, truth).deviance

@@ -1,0 +1,166 @@
+"""What the terms of IEEE Std 952 cannot describe in a spectrum, found before and after they are fitted: lines, filters, bumps."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.stats import chi2
+
+from calibkit.estimation.noise_likelihood import Fit, Problem, maximise, problem, whitened
+from calibkit.estimation.noise_spectrum import Spectrum
+
+Array = NDArray[np.float64]
+
+TAU_F = 0.371  # the Allan variance of noise at frequency f is largest at tau = 0.371 / f, where sin^4(pi f tau) / (pi f tau)^2 is
+_OCTAVE = 35  # bands of 2 %
+_LINE_MODES = 30  # bands with fewer modes are too noisy to show a line
+_LINE_SIGMAS, _LINE_EDGE, _LINE_RATIO = 6.0, 3.0, 1.15  # above the octave around it: where found, how far it reaches, and at least
+_MARGIN = 1.03
+_HALF = np.sqrt(2.0)
+_CUT_SIGMAS, _CUT_RATIO, _MOST_CUTS = 4.0, 0.02, 16
+_ENOUGH_DOF = 1e-3
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Something in the spectrum that is none of the five terms; the fit leaves its frequencies out."""
+
+    kind: Literal["line", "filter", "excess"]
+    f_low: float  # Hz
+    f_high: float
+    tau: float  # s: line: where it shows most in the Allan deviation; filter, excess: down to where the model holds
+    amplitude: float = 0.0  # line: of the sine of its power, x
+
+    def scaled(self, unit: float) -> "Feature":
+        return replace(self, amplitude=self.amplitude * unit)
+
+    @property
+    def text(self) -> str:
+        if self.kind == "line":
+            where = f"{np.sqrt(self.f_low * self.f_high):.3g} Hz"
+            seen = f"amplitude {self.amplitude:.2g}, a bump in the Allan deviation near tau {self.tau:.2g} s"
+            return f"periodic at {where}, {seen}; left out of the fit"
+        what = "falls off (a low-pass filter)" if self.kind == "filter" else "rises above what noise terms describe"
+        return f"the spectrum {what} beyond {self.f_low:.3g} Hz; left out of the fit, so N is that of tau > {self.tau:.2g} s"
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Half an octave of the spectrum against the fitted model."""
+
+    tau: float  # s, where the Allan deviation sees it
+    f: float  # Hz
+    ratio: float  # measured power over the model's
+    dof: float
+    z: float  # (ratio - 1) / sqrt(2 / dof)
+    used: bool
+
+
+def find_lines(record: Spectrum) -> list[Feature]:
+    """Return what stands out of the octave around it: periodic vibration, supply hum, a resonance."""
+    usable = record.count >= _LINE_MODES
+    if usable.sum() < _OCTAVE:
+        return []
+    f, power, count = record.f[usable], record.power[usable], record.count[usable]
+    base = np.exp(median_filter(np.log(np.maximum(power, 1e-300)), size=_OCTAVE, mode="nearest"))
+    excess, sigma = power / base - 1, np.sqrt(2 / count)
+    core = (excess > _LINE_SIGMAS * sigma) & (excess > _LINE_RATIO - 1)
+    reach = (excess > _LINE_EDGE * sigma) & (excess > (_LINE_RATIO - 1) / 3)
+    starts = np.flatnonzero(reach & ~np.concatenate([[False], reach[:-1]]))
+    ends = np.flatnonzero(reach & ~np.concatenate([reach[1:], [False]])) + 1
+    lines = []
+    for a, b in zip(starts, ends, strict=True):
+        if not core[a:b].any():
+            continue
+        variance = float(np.sum((power - base)[a:b] * count[a:b])) / record.duration_s  # two-sided: 2 x df = 1 / T a mode
+        reach_f = (f[a] / _MARGIN, f[b - 1] * _MARGIN)  # a line leaks a little
+        centre = float(np.average(f[a:b], weights=np.maximum(power - base, 0)[a:b] * count[a:b]))
+        lines.append(Feature("line", *reach_f, TAU_F / centre, float(np.sqrt(2 * max(variance, 0.0)))))
+    return lines
+
+
+def mask(f: Array, lines: Sequence[Feature], f_max: float) -> Array:
+    """Return 1 for the frequencies that the fit uses, else 0."""
+    use = f <= f_max
+    for line in lines:
+        use &= (f < line.f_low) | (f > line.f_high)
+    return use.astype(np.float64)
+
+
+def find_cut(records: Sequence[Spectrum], lines: Sequence[Feature]) -> tuple[float, Feature | None]:
+    """Return the frequency up to which the spectrum is the model's: a filter takes power away above it, or something adds.
+
+    From the Nyquist frequency down, half an octave is given up while it differs from the fit of all below it.
+    """
+    nyquist = records[0].rate_hz / 2
+    top, ratio = nyquist, 1.0
+    for _ in range(_MOST_CUTS):
+        below = top / _HALF
+        if sum((r.count * mask(r.f, lines, below)).sum() for r in records) < 200:
+            break
+        terms = [0, 1, 2]
+        p = problem(records, [r.count * mask(r.f, lines, below) for r in records], terms)
+        tested = np.concatenate([r.count * mask(r.f, lines, top) for r in records]) - p.weight
+        if tested.sum() == 0:
+            top = below
+            continue
+        found = float(np.average(p.power / (maximise(p).theta @ p.shape), weights=tested))
+        if abs(found - 1) < max(_CUT_RATIO, _CUT_SIGMAS * np.sqrt(2 / tested.sum())):
+            break
+        top, ratio = below, found
+    if top == nyquist:
+        return nyquist, None
+    return top, Feature("filter" if ratio < 1 else "excess", top, nyquist, TAU_F / top)
+
+
+def misfits(p: Problem, fit: Fit, records: Sequence[Spectrum], weights: Sequence[Array]) -> list[Misfit]:
+    """Return measured over modelled power by half octaves, whatever the fit used or not."""
+    f = np.concatenate([r.low_f for r in records] + [r.f for r in records])
+    ratio = np.concatenate([e * e for e in whitened(p, fit.theta, fit.ramp)] + [p.power / (fit.theta @ p.shape)])
+    dof = np.concatenate([np.ones(len(r.low)) for r in records] + [r.count for r in records])
+    used = np.concatenate([np.ones(sum(len(r.low) for r in records))] + [w > 0 for w in weights]) > 0
+    group = np.floor(2 * np.log2(f / f.min()) + 1e-9).astype(int)
+    out = []
+    for g in np.unique(group):
+        for part in (used, ~used):
+            these = (group == g) & part
+            if not these.any():
+                continue
+            n = float(dof[these].sum())
+            r, centre = float(np.average(ratio[these], weights=dof[these])), float(np.exp(np.average(np.log(f[these]), weights=dof[these])))
+            out.append(Misfit(TAU_F / centre, centre, r, n, (r - 1) / np.sqrt(2 / n), part is used))
+    return out
+
+
+def goodness(found: Sequence[Misfit]) -> float:
+    """Return the probability that a right model fits no better (chi-squared over the half octaves used; each by its own tail)."""
+    used = [m for m in found if m.used]
+    tails = np.array([chi2.sf(m.ratio * m.dof, m.dof) for m in used])
+    worst = 2 * np.minimum(tails, 1 - tails)
+    # Fisher (1925): -2 sum ln p is chi-squared with 2 degrees of freedom each.
+    return float(chi2.sf(-2 * np.sum(np.log(np.maximum(worst, 1e-300))), 2 * len(used)))
+
+
+def discrepancy(found: Sequence[Misfit]) -> float:
+    """Return by how much, relative, the model's power is off from half octave to half octave, beyond chance: 0 where it fits."""
+    used = [m for m in found if m.used]
+    if goodness(used) > _ENOUGH_DOF:
+        return 0.0
+
+    def excess(delta: float) -> float:
+        return sum((m.ratio - 1) ** 2 / (2 / m.dof + delta**2) for m in used) - len(used)
+
+    return _root(excess, 1e-4, 10.0)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a falling function of a positive number crosses zero, by bisection of its logarithm; the end where it does not."""
+    if function(low) <= 0:
+        return 0.0
+    for _ in range(40):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if function(middle) > 0 else (low, middle)
+    return low

@@ -8,7 +8,7 @@ from calibkit.detection.boards import detect
 from calibkit.detection.plane_maps import in_line, local_maps
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState
 from calibkit.geometry import se3
-from calibkit.models.board import AprilGrid, Board, Checkerboard, CircleGrid
+from calibkit.models.board import AprilGrid, Board, Checkerboard
 from calibkit.models.cameras import CAMERAS
 from calibkit.simulation.camera import RenderStyle, SimCamera, inside, random_board_poses
 from calibkit.simulation.render import Renderer
@@ -71,11 +71,8 @@ def test_slanting_light_draws_no_corner(light: float) -> None:
     assert np.abs(slanting - even).max() < 0.002  # 0.009 px where the light is not reckoned with
 
 
-@pytest.mark.parametrize(
-    ("board", "most_px"), [(GRID, 0.015), (CircleGrid(4, 11, 0.05, asymmetric=True), 0.1)], ids=["aprilgrid", "circlegrid"]
-)
-def test_corner_errors_do_not_add_up_to_a_focal_length(board: Board, most_px: float) -> None:
-    rng = np.random.default_rng(3)
+def test_corner_errors_do_not_add_up_to_a_focal_length() -> None:
+    board, rng = GRID, np.random.default_rng(3)
     T = random_board_poses(CAMERA, board, 60, rng, max_tilt=np.deg2rad(40), fill=(0.5, 0.75))
     renderer = Renderer(CAMERA, board, RenderStyle(noise=0.0))
     uv, weight = project(T, board.points), np.zeros((len(T), len(board.points)))
@@ -88,4 +85,4 @@ def test_corner_errors_do_not_add_up_to_a_focal_length(board: Board, most_px: fl
     problem = CameraProblem(board.points, (views,))
     S, score = problem.information(LensState((CAMERA.params,), np.eye(4)[None], T[seen]))
     shift = np.linalg.solve(S.sum(0), score.sum(0))
-    assert np.abs(shift[:2]).max() < most_px, shift
+    assert np.abs(shift[:2]).max() < 0.015, shift  # 0.030 px with maps of second order

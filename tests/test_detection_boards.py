@@ -31,8 +31,8 @@ def test_every_board_that_can_be_drawn_can_be_found() -> None:
         (Checkerboard(8, 5, 0.05, 0.04), 0.02),
         (Charuco(8, 7, 0.05, 0.037, "DICT_5X5_100"), 0.04),
         (Charuco(8, 6, 0.05, 0.037, "DICT_5X5_100", legacy=True), 0.04),
-        (CircleGrid(7, 6, 0.05), 0.05),
-        (CircleGrid(4, 11, 0.03, asymmetric=True), 0.05),
+        (CircleGrid(7, 6, 0.05), 0.04),
+        (CircleGrid(4, 11, 0.03, asymmetric=True), 0.04),
     ],
     ids=lambda b: b.key() if hasattr(b, "key") else "",
 )

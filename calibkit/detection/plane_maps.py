@@ -12,7 +12,6 @@ Array = NDArray[np.float64]
 _NEAR = 0.75  # steps of the board over which neighbours tell where a corner is
 _STIFFNESS = 1e-3  # of the bending, so that few neighbours bend nothing
 _STIFF = np.diag([1e-9, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])  # a lone tag's map bends as little as it can
-_WIDER = 1.3  # than a map's reach, that of the stiffer one
 _NEIGHBOURS = 40  # that a local map is made of: further ones would hardly weigh
 
 
@@ -122,8 +121,8 @@ def _neighbours(points: bytes, reach: float) -> _Neighbours:
     weighted = np.swapaxes(terms * np.exp(-(xx + yy) / 2)[..., None], 1, 2)
     inverse = np.linalg.inv(weighted @ terms + _STIFF)
     units = np.repeat(1 / reach ** np.arange(4), [1, 2, 3, 4])[:, None]
-    # A wrong corner at the board's rim would bend a cubic to itself: whether it belongs is asked of six terms over a wider reach
-    stiffer = np.swapaxes(terms[..., :6] * np.exp(-(xx + yy) / (2 * _WIDER**2))[..., None], 1, 2)
+    # A wrong corner at the board's rim would bend a cubic to itself: whether it belongs is asked of the first six terms
+    stiffer = weighted[:, :6]
     first = np.linalg.inv(stiffer @ terms[..., :6] + _STIFF[:6, :6])[:, :1]
     leverage = np.minimum(first[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1, its terms are 1, 0, 0, ...
     return _Neighbours(near, units * (inverse @ weighted), (first @ stiffer)[:, 0], 1 / np.sqrt(1 - leverage))

@@ -23,6 +23,7 @@ from calibkit.estimation.noise_shape import (
     find_cut,
     find_lines,
     goodness,
+    half_octaves,
     mask,
     misfits,
 )
@@ -121,76 +122,61 @@ def _fit_axis(pieces: Sequence[NDArray[np.floating]], rate_hz: float) -> AxisNoi
     unit = float(np.sqrt(np.mean(np.concatenate([np.diff(c) ** 2 for c in columns]))))
     if unit == 0:
         return _stuck(rate_hz)
-    records = [spectrum((c - c.mean()) / unit, rate_hz) for c in columns]
-    lines = find_lines(max(records, key=lambda r: r.duration_s))
-    f_max, cut = find_cut(records, lines)
-    weights = [r.count * mask(r.f, lines, f_max) for r in records]
-    model, p, fit = _choose(records, weights, f_max)
-    found = misfits(p, fit, records, weights)
-    delta = discrepancy(found)
+    s = spectrum([(c - c.mean()) / unit for c in columns], rate_hz)
+    lines = find_lines(s)
+    f_max, cut = find_cut(s, lines)
+    weight = s.count * mask(s.f, lines, f_max)
+    model, p, fit = _choose(s, weight, f_max)
+    delta = discrepancy(misfits(p, fit, s))
     if delta > 0:
-        weights = _damped(records, weights, delta)
-        p = _problem(records, weights, model)
+        p = _problem(s, _damped(s.f, weight, delta), model)
         fit = maximise(p, fit.theta)
-        found = misfits(p, fit, records, weights)
-    return _axis(records, model, p, fit, unit, f_max, [*lines, *([cut] if cut else [])], found, delta)
+    return _axis(s, model, p, fit, unit, f_max, [*lines, *([cut] if cut else [])], delta)
 
 
-def _problem(records: Sequence[Spectrum], weights: Sequence[Array], model: _Model) -> Problem:
-    return problem(records, weights, model.terms, model.markov_s, model.ramp)
+def _problem(s: Spectrum, weight: Array, model: _Model) -> Problem:
+    return problem(s, weight, model.terms, model.markov_s, model.ramp)
 
 
-def _choose(records: Sequence[Spectrum], weights: Sequence[Array], f_max: float) -> tuple[_Model, Problem, Fit]:
+def _choose(s: Spectrum, weight: Array, f_max: float) -> tuple[_Model, Problem, Fit]:
     """Return the model: N, B, K, and whatever else the likelihood demands."""
-    model = _Model()
-    p = _problem(records, weights, model)
-    fit = maximise(p)
-    for more in (replace(model, terms=(0, 1, 2, 3)), replace(model, ramp=True)):
-        candidate = replace(more, terms=tuple(sorted({*model.terms, *more.terms})), ramp=model.ramp or more.ramp)
-        trial_p = _problem(records, weights, candidate)
-        trial = maximise(trial_p)
-        if fit.deviance - trial.deviance > _TERM_SHOWS:
-            model, p, fit = candidate, trial_p, trial
+
+    def tried(model: _Model) -> tuple[_Model, Problem, Fit]:
+        p = _problem(s, weight, model)
+        return model, p, maximise(p)
+
+    def better(now: tuple[_Model, Problem, Fit], model: _Model, gain: float) -> tuple[_Model, Problem, Fit]:
+        new = tried(model)
+        return new if now[2].deviance - new[2].deviance > gain else now
+
+    best = tried(_Model())
+    best = better(best, replace(best[0], ramp=True), _TERM_SHOWS)
+    best = better(best, replace(best[0], terms=(0, 1, 2, 3)), _TERM_SHOWS)
+    times = np.geomspace(_MARKOV_CORNER / (2 * np.pi * f_max), s.durations_s.max() / 20, _MARKOV_STEPS)
 
     def deviance(log_time: float) -> float:
-        return maximise(_problem(records, weights, replace(model, markov_s=float(np.exp(log_time))))).deviance
+        return tried(replace(best[0], markov_s=float(np.exp(log_time))))[2].deviance
 
-    grid = np.linspace(np.log(_MARKOV_CORNER / (2 * np.pi * f_max)), np.log(max(r.duration_s for r in records) / 20), _MARKOV_STEPS)
-    best = int(np.argmin([deviance(t) for t in grid]))
-    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    at = int(np.argmin([deviance(t) for t in np.log(times)]))
+    bounds = (float(np.log(times[max(at - 1, 0)])), float(np.log(times[min(at + 1, len(times) - 1)])))
     time = float(np.exp(minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 0.02}).x))
-    candidate = replace(model, markov_s=time)
-    trial_p = _problem(records, weights, candidate)
-    trial = maximise(trial_p)
-    return (candidate, trial_p, trial) if fit.deviance - trial.deviance > _MARKOV_SHOWS else (model, p, fit)
+    return better(best, replace(best[0], markov_s=time), _MARKOV_SHOWS)
 
 
-def _damped(records: Sequence[Spectrum], weights: Sequence[Array], delta: float) -> list[Array]:
-    """Return weights of a model that is off by delta from half octave to half octave: modes n count as n / (1 + n delta^2 / 2)."""
-    out = []
-    for record, weight in zip(records, weights, strict=True):
-        group = np.floor(2 * np.log2(record.f * 2 * record.duration_s)).astype(int)
-        n = np.bincount(group, weights=weight)
-        out.append(weight / (1 + n[group] * delta**2 / 2))
-    return out
+def _damped(f: Array, weight: Array, delta: float) -> Array:
+    """Return weights for a model that is off by delta from half octave to half octave: n modes count as n / (1 + n delta^2 / 2)."""
+    group = half_octaves(f, f.min())
+    damped: Array = weight / (1 + np.bincount(group, weight)[group] * delta**2 / 2)
+    return damped
 
 
-def _axis(
-    records: Sequence[Spectrum],
-    model: _Model,
-    p: Problem,
-    fit: Fit,
-    unit: float,
-    f_max: float,
-    features: list[Feature],
-    found: list[Misfit],
-    delta: float,
-) -> AxisNoise:
-    hours = sum(r.duration_s for r in records) / 3600
+def _axis(s: Spectrum, model: _Model, p: Problem, fit: Fit, unit: float, f_max: float, features: list[Feature], delta: float) -> AxisNoise:
+    hours = float(s.durations_s.sum()) / 3600
+    found = misfits(p, fit, s)
     spans = [interval(p, fit, i) for i in range(len(model.terms))]
-    rate_hz = records[0].rate_hz
     needed = [
-        None if span.resolved else hours_to_resolve(fit.theta, spans, model.terms, i, hours, f_max, rate_hz) for i, span in enumerate(spans)
+        None if span.resolved else hours_to_resolve(fit.theta, spans, model.terms, i, hours, f_max, s.rate_hz)
+        for i, span in enumerate(spans)
     ]
     terms = {TERMS[term]: _term(span, unit, need) for term, span, need in zip(model.terms, spans, needed, strict=True)}
     variance = np.linalg.pinv(fit.information)[:3, :3]

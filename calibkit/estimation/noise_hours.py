@@ -12,7 +12,10 @@ from calibkit.estimation.noise_spectrum import shapes
 Array = NDArray[np.float64]
 
 MOST_HOURS = 1000.0
-_RISE = 10.5  # expected gain of the deviance: (1.96 + 1.28)^2, so that nine of ten such recordings resolve the term
+_NO_LOW_MODES = (np.zeros((0, 0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
+# Expected gain of the deviance for nine of ten such recordings to resolve the term: (1.96 + 1.28)^2 = 10.5 were its estimate Gaussian, as
+# flicker's nearly is; a walk is seen over a few cycles only, and needs 20 (measured, 40 seeds).
+_RISE = 20.0
 _PART = 1 / 4  # of the present upper limit: the value that the recording asked for is to resolve
 _STEP = 1.25
 
@@ -20,16 +23,18 @@ _STEP = 1.25
 def hours_to_resolve(
     theta: Array, spans: Sequence[Interval], terms: Sequence[int], i: int, hours: float, f_max: float, rate_hz: float
 ) -> tuple[float, float]:
-    """Return the hours of recording that resolve a coefficient i of a part of its present upper limit, and that value.
+    """Return the hours of recording that resolve coefficient i if it is as large as the recording suggests, and that value.
+
+    The value is what the term has at least by one sigma, or a quarter of its upper limit if that is more.
 
     The expected data of such a recording (its power exactly the model's) are fitted without the term (Cowan et al. 2011, the Asimov set);
-    what the deviance loses is the expected test statistic. What else is not resolved is taken to be there in the same part of its limit.
+    what the deviance loses is the expected test statistic. What else is not resolved is taken to be there likewise.
     Infinite where 1000 h do not do.
     """
-    limit = np.array([0.0 if span.resolved else (_PART * span.upper) ** 2 for span in spans])
-    truth = np.maximum(theta[: len(terms)], limit)
-    truth[i] = limit[i]
-    value = float(np.sqrt(limit[i]))
+    least = np.array([max((_PART * s.upper) ** 2, s.value**2 - 2 * s.value * s.sigma) for s in spans])
+    truth = np.where([s.resolved for s in spans], theta[: len(terms)], np.maximum(theta[: len(terms)], least))
+    truth[i] = least[i]
+    value = float(np.sqrt(least[i]))
     length = hours
     while length < MOST_HOURS:
         length *= _STEP
@@ -42,5 +47,5 @@ def _expected_rise(truth: Array, terms: Sequence[int], i: int, duration_s: float
     edges = np.unique(np.round(np.geomspace(1, 2 * duration_s * f_max, 80)))
     count, f = np.diff(edges), (edges[:-1] + edges[1:] - 1) / 2 / (2 * duration_s)
     shape = shapes(f, rate_hz)[list(terms)]
-    p = Problem(shape, truth @ shape, count, [], [], [])
+    p = Problem(shape, truth @ shape, count, *_NO_LOW_MODES)
     return maximise(p, truth, (i, 0.0)).deviance - maximise(p, truth).deviance

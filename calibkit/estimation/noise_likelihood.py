@@ -12,23 +12,24 @@ from calibkit.estimation.noise_spectrum import Spectrum, flicker_covariance, mar
 
 Array = NDArray[np.float64]
 
+_FLICKER = 1  # its place in TERMS
 _STEPS = 60
 _CONVERGED = 1e-5  # of the deviance
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The modes of one axis, all its records: deviance = sum_b w (ln lambda + p / lambda) + sum (ln det C + d^T C^-1 d).
+    """The modes of one axis: deviance = sum_b w (ln lambda + p / lambda) + sum_pieces (ln det C + e^T C^-1 e).
 
-    lambda = sum_i theta_i shape_i, C = sum_i theta_i covariance_i, d = low modes - R ramp.
+    lambda = sum_i theta_i shape_i, C = sum_i theta_i covariance_i, e = low modes - R ramp.
     """
 
     shape: Array  # (p, b)
     power: Array  # (b,)
     weight: Array  # (b,) modes that the band counts as
-    covariances: Sequence[Array]  # per record (p, m, m)
-    low: Sequence[Array]  # per record (m,)
-    ramps: Sequence[Array]  # per record (m,)
+    covariance: Array  # (r, p, m, m)
+    low: Array  # (r, m)
+    ramp: Array  # (r, m)
     with_ramp: bool = False
 
 
@@ -43,67 +44,52 @@ class Fit:
     information: Array  # (p, p)
 
 
-def problem(
-    records: Sequence[Spectrum],
-    weights: Sequence[Array],
-    terms: Sequence[int],
-    markov_s: float | None = None,
-    with_ramp: bool = False,
-) -> Problem:
-    """Return the problem of fitting the terms (indices into TERMS, and a Gauss-Markov process of that time) to the records."""
+def problem(s: Spectrum, weight: Array, terms: Sequence[int], markov_s: float | None = None, with_ramp: bool = False) -> Problem:
+    """Return the problem of fitting the terms (indices into TERMS, and a Gauss-Markov process of that time) to the spectrum."""
 
-    def basis(f: Array, rate_hz: float) -> Array:
-        rows = shapes(f, rate_hz)[list(terms)]
-        return rows if markov_s is None else np.vstack([rows, markov_shape(f, rate_hz, markov_s)])
+    def basis(f: Array) -> Array:
+        rows = shapes(f, s.rate_hz)[list(terms)]
+        return rows if markov_s is None else np.concatenate([rows, markov_shape(f, s.rate_hz, markov_s)[None]])
 
-    covariances = []
-    for record in records:
-        C = np.stack([np.diag(row) for row in basis(record.low_f, record.rate_hz)])
-        if 1 in terms:
-            C[list(terms).index(1)] = flicker_covariance(len(record.low), record.duration_s)
-        covariances.append(C)
-    return Problem(
-        np.concatenate([basis(record.f, record.rate_hz) for record in records], axis=1),
-        np.concatenate([record.power for record in records]),
-        np.concatenate(list(weights)),
-        covariances,
-        [record.low for record in records],
-        [ramp_modes(len(record.low), record.duration_s) for record in records],
-        with_ramp,
-    )
+    m = s.low.shape[1]
+    covariance = np.moveaxis(basis(s.low_f), 0, 1)[..., None] * np.eye(m)
+    if _FLICKER in terms:
+        covariance[:, list(terms).index(_FLICKER)] = flicker_covariance(m) * s.durations_s[:, None, None]
+    ramp = ramp_modes(m) * s.durations_s[:, None] ** 1.5
+    return Problem(basis(s.f), s.power, weight, covariance, s.low, ramp, with_ramp)
 
 
-def whitened(p: Problem, theta: Array, ramp: float) -> list[Array]:
-    """Return each record's low modes made independent, of unit variance if the model is right, in order of frequency."""
-    out = []
-    for C, d, v in zip(p.covariances, p.low, p.ramps, strict=True):
-        L = np.linalg.cholesky(np.tensordot(theta, C, 1))
-        out.append(solve_triangular(L, d - ramp * v, lower=True))
-    return out
+def whitened(p: Problem, fit: Fit) -> Array:
+    """Return the low modes (r, m) made independent, of unit variance if the model is right, in order of frequency."""
+    L = np.linalg.cholesky(np.tensordot(p.covariance, fit.theta, (1, 0)))
+    white: Array = np.linalg.solve(L, (p.low - fit.ramp * p.ramp)[..., None])[..., 0]
+    return white
 
 
 def _low_modes(p: Problem, theta: Array, ramp: float | None) -> tuple[float, Array, Array, float, float]:
     """Return deviance, score, information, R and its variance of the low modes; R is estimated unless given."""
-    deviance, score, information = 0.0, np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-    inverses = [np.linalg.inv(np.tensordot(theta, C, 1)) for C in p.covariances]
-    precision = sum(float(v @ W @ v) for v, W in zip(p.ramps, inverses, strict=True))
-    R = ramp
-    if R is None:
-        R = sum(float(v @ W @ d) for v, W, d in zip(p.ramps, inverses, p.low, strict=True)) / precision
-    for C, W, d, v in zip(p.covariances, inverses, p.low, p.ramps, strict=True):
-        e = W @ (d - R * v)
-        deviance += float((d - R * v) @ e) - float(np.linalg.slogdet(W)[1])
-        WC = W @ C
-        score += 0.5 * (np.einsum("i,pij,j->p", e, C, e) - np.trace(WC, axis1=1, axis2=2))
-        information += 0.5 * np.einsum("pij,qji->pq", WC, WC, optimize=True)
-    return deviance, score, information, R, 1 / precision if precision else 0.0
+    W = np.linalg.inv(np.tensordot(p.covariance, theta, (1, 0)))
+    W_ramp = np.einsum("rij,rj->ri", W, p.ramp)
+    precision = float(np.sum(W_ramp * p.ramp))
+    R = float(np.sum(W_ramp * p.low)) / precision if ramp is None else ramp
+    e = p.low - R * p.ramp
+    We = np.einsum("rij,rj->ri", W, e)
+    WC = W[:, None] @ p.covariance
+    flat = WC.swapaxes(0, 1).reshape(len(theta), -1)
+    flat_t = WC.swapaxes(2, 3).swapaxes(0, 1).reshape(len(theta), -1)
+    score = 0.5 * (np.einsum("ri,rpij,rj->p", We, p.covariance, We, optimize=True) - np.trace(WC, axis1=2, axis2=3).sum(axis=0))
+    deviance = float(np.sum(e * We)) - float(np.sum(np.linalg.slogdet(W)[1]))
+    return deviance, score, 0.5 * flat @ flat_t.T, R, 1 / precision
 
 
 def _evaluate(p: Problem, theta: Array, ramp: float | None) -> tuple[float, Array, Array, float, float]:
     level = theta @ p.shape
     if not np.all(level > 0):
         return np.inf, np.zeros(len(theta)), np.zeros((len(theta), len(theta))), 0.0, 0.0
-    deviance, score, information, R, variance = _low_modes(p, theta, ramp)
+    if len(p.low):
+        deviance, score, information, R, variance = _low_modes(p, theta, ramp)
+    else:
+        deviance, score, information, R, variance = 0.0, np.zeros(len(theta)), np.zeros((len(theta), len(theta))), 0.0, 0.0
     relative = p.shape / level
     ratio = p.power / level
     deviance += float(p.weight @ (np.log(level) + ratio))
@@ -113,17 +99,15 @@ def _evaluate(p: Problem, theta: Array, ramp: float | None) -> tuple[float, Arra
 
 
 def start(p: Problem) -> Array:
-    """Return a first theta: each term as large as the smallest excess over an octave or so allows."""
-    groups = np.array_split(np.arange(len(p.power)), max(1, len(p.power) // 40))
-    mean = np.array([np.average(p.power[g], weights=p.weight[g]) for g in groups if p.weight[g].sum() > 0])
-    shape = np.array([np.average(p.shape[:, g], axis=1, weights=p.weight[g]) for g in groups if p.weight[g].sum() > 0])
-    envelope = (mean[:, None] / shape).min(axis=0) if len(mean) else np.full(len(p.shape), np.inf)
-    if p.low:
-        low = np.concatenate([d * d for d in p.low]).mean()
-        low_shape = np.concatenate([np.diagonal(C, axis1=1, axis2=2) for C in p.covariances], axis=1).mean(axis=1)
-        envelope = np.minimum(envelope, low / low_shape)
-    first: Array = envelope
-    return first
+    """Return a first theta: each term as large as the least power over an octave or so allows."""
+    groups = [g for g in np.array_split(np.arange(len(p.power)), max(1, len(p.power) // 40)) if p.weight[g].sum() > 0]
+    power = [float(np.average(p.power[g], weights=p.weight[g])) for g in groups]
+    shape = [np.average(p.shape[:, g], axis=1, weights=p.weight[g]) for g in groups]
+    if len(p.low):
+        power.append(float(np.mean(p.low**2)))
+        shape.append(np.diagonal(p.covariance, axis1=2, axis2=3).mean(axis=(0, 2)))
+    envelope: Array = np.min(np.array(power)[:, None] / np.array(shape), axis=0)
+    return envelope
 
 
 def maximise(p: Problem, first: Array | None = None, fixed: tuple[int, float] | None = None, ramp: float | None = None) -> Fit:

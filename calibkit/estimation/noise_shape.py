@@ -20,7 +20,7 @@ _LINE_MODES = 30  # bands with fewer modes are too noisy to show a line
 _LINE_SIGMAS, _LINE_EDGE, _LINE_RATIO = 6.0, 3.0, 1.15  # above the octave around it: where found, how far it reaches, and at least
 _MARGIN = 1.03
 _HALF = np.sqrt(2.0)
-_CUT_SIGMAS, _CUT_RATIO, _MOST_CUTS = 4.0, 0.02, 16
+_CUT_SIGMAS, _CUT_RATIO, _MOST_CUTS, _LEAST_MODES = 4.0, 0.02, 16, 200
 _ENOUGH_DOF = 1e-3
 
 
@@ -59,12 +59,12 @@ class Misfit:
     used: bool
 
 
-def find_lines(record: Spectrum) -> list[Feature]:
+def find_lines(s: Spectrum) -> list[Feature]:
     """Return what stands out of the octave around it: periodic vibration, supply hum, a resonance."""
-    usable = record.count >= _LINE_MODES
+    usable = s.count >= _LINE_MODES
     if usable.sum() < _OCTAVE:
         return []
-    f, power, count = record.f[usable], record.power[usable], record.count[usable]
+    f, power, count = s.f[usable], s.power[usable], s.count[usable]
     base = np.exp(median_filter(np.log(np.maximum(power, 1e-300)), size=_OCTAVE, mode="nearest"))
     excess, sigma = power / base - 1, np.sqrt(2 / count)
     core = (excess > _LINE_SIGMAS * sigma) & (excess > _LINE_RATIO - 1)
@@ -75,7 +75,7 @@ def find_lines(record: Spectrum) -> list[Feature]:
     for a, b in zip(starts, ends, strict=True):
         if not core[a:b].any():
             continue
-        variance = float(np.sum((power - base)[a:b] * count[a:b])) / record.duration_s  # two-sided: 2 x df = 1 / T a mode
+        variance = float(np.sum((power - base)[a:b] * count[a:b])) / s.durations_s.sum()  # two-sided: 2 x df = 1 / T a mode
         reach_f = (f[a] / _MARGIN, f[b - 1] * _MARGIN)  # a line leaks a little
         centre = float(np.average(f[a:b], weights=np.maximum(power - base, 0)[a:b] * count[a:b]))
         lines.append(Feature("line", *reach_f, TAU_F / centre, float(np.sqrt(2 * max(variance, 0.0)))))
@@ -90,49 +90,65 @@ def mask(f: Array, lines: Sequence[Feature], f_max: float) -> Array:
     return use.astype(np.float64)
 
 
-def find_cut(records: Sequence[Spectrum], lines: Sequence[Feature]) -> tuple[float, Feature | None]:
+def find_cut(s: Spectrum, lines: Sequence[Feature]) -> tuple[float, Feature | None]:
     """Return the frequency up to which the spectrum is the model's: a filter takes power away above it, or something adds.
 
-    From the Nyquist frequency down, half an octave is given up while it differs from the fit of all below it.
+    From the Nyquist frequency down, half an octave is given up while it differs from the fit of all below it and quantisation does not
+    explain it.
     """
-    nyquist = records[0].rate_hz / 2
+    nyquist = s.rate_hz / 2
     top, ratio = nyquist, 1.0
     for _ in range(_MOST_CUTS):
         below = top / _HALF
-        if sum((r.count * mask(r.f, lines, below)).sum() for r in records) < 200:
+        used = s.count * mask(s.f, lines, below)
+        tested = s.count * mask(s.f, lines, top) - used
+        if used.sum() < _LEAST_MODES:
             break
-        terms = [0, 1, 2]
-        p = problem(records, [r.count * mask(r.f, lines, below) for r in records], terms)
-        tested = np.concatenate([r.count * mask(r.f, lines, top) for r in records]) - p.weight
-        if tested.sum() == 0:
-            top = below
-            continue
-        found = float(np.average(p.power / (maximise(p).theta @ p.shape), weights=tested))
-        if abs(found - 1) < max(_CUT_RATIO, _CUT_SIGMAS * np.sqrt(2 / tested.sum())):
-            break
-        top, ratio = below, found
+        if tested.sum() > 0:
+            p = problem(s, used, (0, 1, 2))
+            found = float(np.average(p.power / (maximise(p).theta @ p.shape), weights=tested))
+            if _small(found, tested.sum()) or (found > 1 and top == nyquist and _quantised(s, lines)):
+                break
+            ratio = found
+        top = below
     if top == nyquist:
         return nyquist, None
     return top, Feature("filter" if ratio < 1 else "excess", top, nyquist, TAU_F / top)
 
 
-def misfits(p: Problem, fit: Fit, records: Sequence[Spectrum], weights: Sequence[Array]) -> list[Misfit]:
-    """Return measured over modelled power by half octaves, whatever the fit used or not."""
-    f = np.concatenate([r.low_f for r in records] + [r.f for r in records])
-    ratio = np.concatenate([e * e for e in whitened(p, fit.theta, fit.ramp)] + [p.power / (fit.theta @ p.shape)])
-    dof = np.concatenate([np.ones(len(r.low)) for r in records] + [r.count for r in records])
-    used = np.concatenate([np.ones(sum(len(r.low) for r in records))] + [w > 0 for w in weights]) > 0
-    group = np.floor(2 * np.log2(f / f.min()) + 1e-9).astype(int)
-    out = []
-    for g in np.unique(group):
-        for part in (used, ~used):
-            these = (group == g) & part
-            if not these.any():
-                continue
-            n = float(dof[these].sum())
-            r, centre = float(np.average(ratio[these], weights=dof[these])), float(np.exp(np.average(np.log(f[these]), weights=dof[these])))
-            out.append(Misfit(TAU_F / centre, centre, r, n, (r - 1) / np.sqrt(2 / n), part is used))
-    return out
+def _small(ratio: float, dof: float) -> bool:
+    return bool(abs(ratio - 1) < max(_CUT_RATIO, _CUT_SIGMAS * np.sqrt(2 / dof)))
+
+
+def _quantised(s: Spectrum, lines: Sequence[Feature]) -> bool:
+    """Return whether white noise with quantisation describes the upper octaves."""
+    weight = s.count * mask(s.f, lines, s.rate_hz / 2)
+    p = problem(s, weight, (0, 1, 2, 3))
+    fit = maximise(p)
+    return all(_small(m.ratio, m.dof) for m in misfits(p, fit, s) if m.used and m.f > s.rate_hz / 16)
+
+
+def misfits(p: Problem, fit: Fit, s: Spectrum) -> list[Misfit]:
+    """Return measured over modelled power by half octaves, whether the fit used them or not."""
+    f = np.concatenate([s.low_f.ravel(), s.f])
+    ratio = np.concatenate([whitened(p, fit).ravel() ** 2, p.power / (fit.theta @ p.shape)])
+    dof = np.concatenate([np.ones(s.low.size), s.count])
+    used = np.concatenate([np.ones(s.low.size, dtype=bool), p.weight > 0])
+    group = 2 * half_octaves(f, f.min()) + ~used
+    n = np.bincount(group, dof)
+    seen = n > 0
+    n = n[seen]
+    mean = np.bincount(group, dof * ratio)[seen] / n
+    centre = np.exp(np.bincount(group, dof * np.log(f))[seen] / n)
+    z = (mean - 1) / np.sqrt(2 / n)
+    parts = zip(TAU_F / centre, centre, mean, n, z, np.flatnonzero(seen) % 2 == 0, strict=True)
+    return [Misfit(float(t), float(c), float(r), float(d), float(zed), bool(u)) for t, c, r, d, zed, u in parts]
+
+
+def half_octaves(f: Array, lowest: float) -> NDArray[np.int64]:
+    """Return the number of the half octave above the lowest frequency."""
+    number: NDArray[np.int64] = np.floor(2 * np.log2(f / lowest) + 1e-9).astype(np.int64)
+    return number
 
 
 def goodness(found: Sequence[Misfit]) -> float:

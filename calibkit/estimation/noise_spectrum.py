@@ -6,6 +6,7 @@ periodogram with its leakage is not); flicker noise is correlated by 0.12 at mos
 So one cosine transform makes a likelihood of the record: the lowest modes with their full covariance, the rest averaged in bands.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,48 +17,55 @@ from scipy.special import sici
 Array = NDArray[np.float64]
 
 TERMS = ("white", "flicker", "walk", "quantisation")  # of the linear model: PSD = sum of coefficient^2 x shape(f)
-LOW = 40  # modes taken with their full covariance
+LOW, _LEAST_LOW = 40, 8  # modes taken with their full covariance: of one piece, and of each of many
 _BAND = 0.02  # relative width of a band: the spectrum's slope within it cannot be seen
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Modes of one uninterrupted record: the low ones singly, the others averaged. Powers are two-sided PSDs, x^2 / Hz."""
+    """Modes of the r pieces of a recording: the low ones singly, the others averaged. Powers are two-sided PSDs, x^2 / Hz."""
 
     rate_hz: float
-    duration_s: float
-    low: Array  # (m,) amplitudes of the modes 1 .. m, x / sqrt(Hz)
-    f: Array  # (b,) mean frequency of each band
+    durations_s: Array  # (r,)
+    low: Array  # (r, m) amplitudes of the modes 1 .. m, x / sqrt(Hz)
+    f: Array  # (b,) mean frequency of each band, rising
     count: Array  # (b,) modes in it
     power: Array  # (b,) mean squared amplitude
 
     @property
     def low_f(self) -> Array:
-        f: Array = np.arange(1, len(self.low) + 1) / (2 * self.duration_s)
+        """Return the frequencies (r, m) of the low modes."""
+        f: Array = np.arange(1, self.low.shape[1] + 1) / (2 * self.durations_s[:, None])
         return f
 
 
-def spectrum(x: Array, rate_hz: float) -> Spectrum:
-    """Return the modes of samples x (n,)."""
-    n = len(x)
-    mode = dct(x, norm="ortho")[1:] / np.sqrt(rate_hz)
-    low, edges = band_edges(n)
-    duration = n / rate_hz
-    # A ramp's amplitudes fall as 1 / k^2 and are nothing beyond the low modes unless it is huge; what mode 1 can be of it is taken out.
+def spectrum(pieces: Sequence[Array], rate_hz: float) -> Spectrum:
+    """Return the modes of uninterrupted pieces of samples (n_i,), which count as independent."""
+    m = max(_LEAST_LOW, int(LOW / np.sqrt(len(pieces))))
+    low, sums = np.empty((len(pieces), m)), []
+    for row, x in zip(low, pieces, strict=True):
+        mode = dct(x, norm="ortho")[1:] / np.sqrt(rate_hz)
+        row[:] = mode[:m]
+        sums.append(_band_sums(mode, m, rate_hz))
+    f, count, power = np.concatenate(sums, axis=1)
+    # Pieces of one recording share bands, so that a hundred of them cost no more than one.
+    _, group = np.unique(np.floor(np.log(f / f.min()) / _BAND), return_inverse=True)
+    total = np.bincount(group, count).astype(np.float64)
+    durations = np.array([len(x) / rate_hz for x in pieces])
+    return Spectrum(rate_hz, durations, low, np.bincount(group, f * count) / total, total, np.bincount(group, power) / total)
+
+
+def _band_sums(mode: Array, low: int, rate_hz: float) -> Array:
+    """Return frequency, number of modes and summed squares (3, b) of the bands beyond the low modes."""
+    n = len(mode) + 1
     k = np.arange(low + 1, n)
-    rest = mode[low:] - np.where(k % 2 == 1, mode[0] / k.astype(np.float64) ** 2, 0.0)
-    count = np.diff(edges).astype(np.float64)
-    power = np.add.reduceat(rest * rest, edges[:-1] - low - 1) / count if len(count) else np.zeros(0)
-    f = (edges[:-1] + edges[1:] - 1) / 2 / (2 * duration)
-    return Spectrum(rate_hz, duration, mode[:low], f, count, power)
-
-
-def band_edges(n: int) -> tuple[int, NDArray[np.int64]]:
-    """Return the number of low modes of n samples, and the first mode of each band with n at the end."""
-    low = min(LOW, n - 1)
-    count = max(2, int(np.log(n / (low + 1)) / _BAND))
-    edges = np.unique(np.round(np.geomspace(low + 1, n, count)).astype(np.int64))
-    return low, edges
+    # A ramp's amplitudes, cos / sin^2 of pi k / 2 n for odd k, are nothing here unless it is huge; what mode 1 can be of it is taken out.
+    half = np.pi / (2 * n)
+    ramp = np.where(k % 2 == 1, np.cos(half * k) / np.sin(half * k) ** 2, 0.0) * np.tan(half) * np.sin(half)
+    squares = (mode[low:] - mode[0] * ramp) ** 2
+    edges = np.unique(np.round(np.geomspace(low + 1, n, max(2, int(np.log(n / (low + 1)) / _BAND)))).astype(np.int64))
+    f = (edges[:-1] + edges[1:] - 1) / 2 * rate_hz / (2 * n)
+    return np.stack([f, np.diff(edges).astype(np.float64), np.add.reduceat(squares, edges[:-1] - low - 1)])
 
 
 def shapes(f: Array, rate_hz: float) -> Array:
@@ -77,12 +85,12 @@ def markov_shape(f: Array, rate_hz: float, time_s: float) -> Array:
     return psd
 
 
-def flicker_covariance(modes: int, duration_s: float) -> Array:
-    """Return the covariance (m, m) of the modes' amplitudes under flicker noise of B = 1, whose generalised covariance is -ln|t| / pi.
+def flicker_covariance(modes: int) -> Array:
+    """Return the covariance (m, m) of the modes' amplitudes under flicker noise of B = 1 over a duration of 1 s (T s: T times as much).
 
-    The double integral of c_k(s) c_l(t) ln|s - t| has a closed form: with a = k pi, b = l pi the covariance is
-    (2 T / pi) (Si(a) / a - (1 - cos a) / a^2) on the diagonal, -(4 T / pi) (Cin(a) - Cin(b)) / (a^2 - b^2) where k and l
-    are both even or both odd, else zero.
+    The generalised covariance of flicker is -ln|t| / pi, and the double integral of c_k(s) c_l(t) ln|s - t| has a closed form: with
+    a = k pi, b = l pi the modes' covariance is (2 / pi) (Si(a) / a - (1 - cos a) / a^2) on the diagonal,
+    -(4 / pi) (Cin(a) - Cin(b)) / (a^2 - b^2) where k and l are both even or both odd, else zero.
     """
     k = np.arange(1, modes + 1)
     a = np.pi * k
@@ -91,12 +99,12 @@ def flicker_covariance(modes: int, duration_s: float) -> Array:
     gap = np.where(k[:, None] == k, 1.0, a[:, None] ** 2 - a**2)
     covariance = np.where((k[:, None] - k) % 2 == 0, -2 * (cin[:, None] - cin) / gap, 0.0)
     covariance[k - 1, k - 1] = si / a - (1 - np.cos(a)) / a**2
-    scaled: Array = 2 * duration_s / np.pi * covariance
+    scaled: Array = 2 / np.pi * covariance
     return scaled
 
 
-def ramp_modes(modes: int, duration_s: float) -> Array:
-    """Return the amplitudes (m,) of a ramp of 1 x / s: -2 sqrt(2) T^1.5 / (k pi)^2 for odd k, else 0."""
+def ramp_modes(modes: int) -> Array:
+    """Return the amplitudes (m,) of a ramp of 1 x / s over 1 s (T s: T^1.5 times as much): -2 sqrt(2) / (k pi)^2 for odd k, else 0."""
     k = np.arange(1, modes + 1)
-    amplitude: Array = np.where(k % 2 == 1, -2 * np.sqrt(2) * duration_s**1.5 / (np.pi * k) ** 2, 0.0)
+    amplitude: Array = np.where(k % 2 == 1, -2 * np.sqrt(2) / (np.pi * k) ** 2, 0.0)
     return amplitude

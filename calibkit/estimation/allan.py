@@ -10,24 +10,25 @@ cumulative sum of X (NIST SP1065, Riley 2008, section 5.2):
 """
 
 import os
-from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from calibkit.errors import BadInputError
 from calibkit.estimation.allan_confidence import interval, noise_exponents
+from calibkit.estimation.allan_squares import SPAN, short_squares, squares, thinned_mean_squares
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CONFIDENCE = 0.95
-_BLOCK = 8192  # samples worked on at once: they stay in the cache, and BLAS starts no threads for a dot product below 10 000
 _FINEST = 16  # the decimated mode's stride is at most tau / 16
 _ERROR = 1.5e-4  # the decimated mode's relative error where white noise dominates, one sigma
-_HALVES = 5e-4  # where the even and odd halves of the terms disagree by more, the stride is halved
+_KEPT = 1 << 14  # terms that are kept: a short recording is not thinned, it is cheap as it is
+_ABSURD = 1e100  # a power of the rates that no sensor has, and whose cumulative sums overflow
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,10 @@ class _Kind:
     overlapped: bool = True
     reflected: bool = False
     time: bool = False
+
+    @property
+    def thinnable(self) -> bool:
+        return self.overlapped and not self.reflected
 
 
 KINDS = {
@@ -82,7 +87,8 @@ def deviation(
 
     exact takes every overlapping term. Otherwise long averaging times take every s-th term only, s <= tau / 16 and a power of two: within
     1e-3 of exact. Averaging times are rounded to whole samples (to multiples of s), and those longer than the recording allows are left
-    out: the result says which. The interval is chi-squared with the equivalent degrees of freedom of the noise found at each averaging time (`allan_confidence`).
+    out: the result says which. The interval is chi-squared, with the equivalent degrees of freedom of the noise found at each averaging
+    time (`allan_confidence`).
     BadInputError: values that are not finite, too few samples, a rate or averaging time that is not positive, none short enough.
     ValueError: kind, shape.
     """
@@ -94,17 +100,26 @@ def deviation(
     n = len(x)
     m = _lags(log_spaced(n, rate_hz) if tau is None else np.atleast_1d(np.asarray(tau, np.float64)), rate_hz, n, of)
     strides = np.ones_like(m)
-    if not exact and of.overlapped and not of.reflected:
-        strides = _strides(m, _terms(m, n, of))
-        m = np.round(m / strides).astype(np.int64) * strides
+    if of.thinnable and not exact:
+        strides = _strides(m, _terms(m, n, of), of)
+        grid = np.where(strides > 1, 2 * strides, 1)
+        m = np.round(m / grid).astype(np.int64) * grid
         keep = (_terms(m, n, of) > 0) & (np.diff(m, prepend=0) > 0)
         m, strides = m[keep], strides[keep]
 
     def channel(j: int) -> tuple[Array, Ints]:
-        phase = _cumulative(x[:, j])
-        return _mean_squares(phase, m, strides, of), noise_exponents(phase, m, of.order if not of.modified else 2)
+        phase = _centred(x[:, j])
+        short = np.full(len(m), np.nan)
+        if of.thinnable and not exact and not of.modified:
+            within = m * of.order <= SPAN
+            short[within] = short_squares(phase[1:], m[within], of.order) / _terms(m[within], n, of)
+        np.cumsum(phase, out=phase)
+        return np.where(np.isnan(short), _mean_squares(phase, m, strides, of, np.isnan(short)), short), noise_exponents(
+            phase, m, of.order - of.modified
+        )
 
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+    # The channels are the threads; BLAS's own would only fight with them.
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         found = list(pool.map(channel, range(x.shape[1])))
     seconds, alpha = m / rate_hz, np.stack([a for _, a in found], axis=1)
     dev = np.sqrt(np.stack([s for s, _ in found], axis=1) / of.divisor) / (m**2 if of.modified else m)[:, None]
@@ -121,8 +136,6 @@ def _check(x: Array, rate_hz: float) -> None:
         raise BadInputError(f"a sampling rate of {rate_hz} Hz is none: give a positive one")
     if len(x) < 8:
         raise BadInputError(f"{len(x)} samples are too few for an Allan deviation: record hours, not moments")
-    if not np.isfinite(np.einsum("nc->", x)) and not np.isfinite(x).all():
-        raise BadInputError("the rates hold values that are not finite: remove those samples from the recording")
 
 
 def _lags(tau: Array, rate_hz: float, n: int, of: _Kind) -> Ints:
@@ -145,84 +158,41 @@ def _terms(m: Ints, n: int, of: _Kind) -> Ints:
     return every if of.overlapped else -(-every // m)
 
 
-def _strides(m: Ints, terms: Ints) -> Ints:
+def _strides(m: Ints, terms: Ints, of: _Kind) -> Ints:
     """Return the power of two by which the terms at each lag may be thinned.
 
     White rates make X a random walk; the mean over every s-th of its squared second differences then has a relative error of
     s / sqrt(m terms), half of that in the deviation.
     """
-    most = np.minimum(m / _FINEST, 2 * _ERROR * np.sqrt(m * terms))
+    most = np.minimum(np.minimum(m / _FINEST, terms / _KEPT), 2 * _ERROR * np.sqrt(m * terms))
+    most = np.where((m * of.order <= SPAN) & (not of.modified), 1.0, most)
     return np.asarray(2 ** np.floor(np.log2(np.maximum(most, 1))).astype(np.int64))
 
 
-def _cumulative(y: Array) -> Array:
-    """Return the cumulative sum of y less its mean, from 0: what is left of the mean would grow with n and cost digits."""
-    total = np.empty(len(y) + 1)
-    total[0] = 0.0
-    np.subtract(y, y.mean(), out=total[1:])
-    np.cumsum(total, out=total)
-    return total
+def _centred(rates: Array) -> Array:
+    """Return 0 and then the rates less their mean, which would grow in a cumulative sum and cost digits; BadInputError: not finite."""
+    phase = np.zeros(len(rates) + 1)
+    y = phase[1:]
+    y[:] = rates
+    with np.errstate(over="ignore", invalid="ignore"):
+        y -= y.mean()
+        power = y @ y
+    if not power < _ABSURD:
+        raise BadInputError("the rates hold values that are not finite, or absurdly large: remove those samples from the recording")
+    return phase
 
 
-def _mean_squares(phase: Array, m: Ints, strides: Ints, of: _Kind) -> Array:
-    """Return the mean square of the p-th differences of one channel at each lag."""
+def _mean_squares(phase: Array, m: Ints, strides: Ints, of: _Kind, wanted: NDArray[np.bool_]) -> Array:
+    """Return the mean square of the p-th differences of one channel at each lag that is wanted."""
+    result = np.empty(len(m))
     if of.reflected:
         middle = len(phase) - 2
         longer = np.concatenate([2 * phase[0] - phase[-2:0:-1], phase, 2 * phase[-1] - phase[-2:0:-1]])
-        return np.array([_squares(longer[middle + 1 - lag : 2 * middle + 1 + lag], [lag], 2).sum() / middle for lag in m.tolist()])
-    series = _cumulative(phase) if of.modified else phase
+        for k, lag in enumerate(m.tolist()):
+            result[k] = squares(longer[middle + 1 - lag : 2 * middle + 1 + lag], m[k : k + 1], of.order)[0] / middle
+        return result
+    series = np.cumsum(np.concatenate([[0.0], phase - phase.mean()])) if of.modified else phase
     if not of.overlapped:
         return np.array([np.mean(np.diff(series[::lag], of.order) ** 2) for lag in m.tolist()])
-    result = np.empty(len(m))
-    left, s = strides.copy(), int(strides.max())
-    while s:
-        # From the coarsest stride down: what is not good enough with this one is done again with the next.
-        now = np.flatnonzero(left == s)
-        if len(now):
-            lags = m[now] // s
-            thinned = series if s == 1 else series[::s].copy()
-            squares = _squares(thinned, lags.tolist(), of.order, halves=s > 1)
-            count = len(thinned) - of.order * lags
-            result[now] = squares.sum(axis=1) / count
-            even = squares[:, 0] / ((count + 1) // 2)
-            rough = (np.abs(even - result[now]) > 2 * _HALVES * result[now]) & (s > 1)
-            left[now[rough]] //= 2
-        s //= 2
+    result[wanted] = thinned_mean_squares(series, m[wanted], strides[wanted], of.order)
     return result
-
-
-def _squares(p: Array, lags: Sequence[int], order: int, halves: bool = False) -> Array:
-    """Return the sums of squares (lags, 2) of the differences of p at ascending lags: of even and odd terms, or of all in the first."""
-    sums, scaled, scratch = np.zeros((len(lags), 2)), order * p, np.empty(_BLOCK)
-    difference = _DIFFERENCES[order]
-    for start in range(0, len(p) - order * lags[0], _BLOCK):
-        for k, lag in enumerate(lags):
-            size = min(_BLOCK, len(p) - order * lag - start)
-            if size <= 0:
-                break
-            d = difference(p, scaled, start, lag, scratch[:size])
-            total = d @ d
-            if halves:
-                even = d[::2] @ d[::2]
-                sums[k] += even, total - even
-            else:
-                sums[k, 0] += total
-    return sums
-
-
-def _second(p: Array, scaled: Array, i: int, m: int, d: Array) -> Array:
-    """Fill d with p[i + 2m] - 2 p[i + m] + p[i], scaled being 2 p."""
-    np.subtract(p[i + 2 * m : i + 2 * m + len(d)], scaled[i + m : i + m + len(d)], out=d)
-    d += p[i : i + len(d)]
-    return d
-
-
-def _third(p: Array, scaled: Array, i: int, m: int, d: Array) -> Array:
-    """Fill d with p[i + 3m] - 3 p[i + 2m] + 3 p[i + m] - p[i], scaled being 3 p."""
-    np.subtract(p[i + 3 * m : i + 3 * m + len(d)], scaled[i + 2 * m : i + 2 * m + len(d)], out=d)
-    d += scaled[i + m : i + m + len(d)]
-    d -= p[i : i + len(d)]
-    return d
-
-
-_DIFFERENCES: dict[int, Callable[[Array, Array, int, int, Array], Array]] = {2: _second, 3: _third}

@@ -1,6 +1,7 @@
 """How far an Allan deviation may be trusted: the noise at each averaging time, its equivalent degrees of freedom, a chi-squared interval.
 
-Spectra are named by alpha, the exponent of the rates' spectrum f^alpha: 2 white phase, 1 flicker phase, 0 white, -1 flicker, -2 random walk.
+Spectra are named by alpha, the exponent of the rates' spectrum f^alpha: 2 white phase, 1 flicker phase, 0 white, -1 flicker,
+-2 random walk.
 """
 
 from functools import lru_cache
@@ -14,14 +15,15 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _POINTS = 30  # averages below which the noise cannot be told, and that of the averaging time before is kept
-_ENOUGH = 1 << 14  # averages looked at: the autocorrelation is then known to 0.01
+_ENOUGH = 8192  # averages looked at: the autocorrelation is then known to 0.01, and BLAS starts no threads for a dot product
 _FINE = 128  # from this averaging factor on the sums are those of the continuous limit, where only the ratio of spans matters
 
 
 def noise_exponents(phase: Array, m: Ints, d: int) -> Ints:
-    """Return alpha at each lag of a phase (the cumulative sum of rates), from the lag-1 autocorrelation r of its averages (Riley & Greenhall 2004).
+    """Return alpha at each lag of a phase (the cumulative sum of rates), from the lag-1 autocorrelation r of the averages.
 
-    delta = r / (1 + r) is -p / 2 for noise f^p; steeper noise is differenced first. Within 2 .. 2 - 2 d for a variance of d-th differences.
+    delta = r / (1 + r) is -p / 2 for noise f^p; steeper noise is differenced first (Riley & Greenhall 2004). Within 2 .. 2 - 2 d for a
+    variance of d-th differences.
     """
     found = np.empty(len(m), np.int64)
     alpha = 0
@@ -50,7 +52,7 @@ def _lag1_exponent(z: Array, d: int) -> int:
 def interval(
     d: int, modified: bool, overlapped: bool, total: bool, m: Ints, points: int, alpha: Ints, confidence: float
 ) -> tuple[Array, Array, Array]:
-    """Return edf, and the factors (k, c) that make the lower and upper end of the two-sided chi-squared interval of a deviation (SP1065 eq. 46).
+    """Return edf, and the factors (k, c) that make a deviation the ends of its two-sided chi-squared interval (SP1065 eq. 46).
 
     edf s^2 / sigma^2 is chi-squared of edf degrees of freedom, s being the deviation found and sigma the true one.
     """
@@ -71,7 +73,7 @@ _TOTAL = {0: (1.5, 0.0), -1: (1.17, 0.22), -2: (0.93, 0.36)}  # edf = b T / tau 
 
 
 def degrees_of_freedom(d: int, modified: bool, overlapped: bool, m: int, points: int, alpha: int) -> float:
-    """Return the equivalent degrees of freedom of a variance of d-th differences of phase `points` at lag m (Greenhall & Riley 2003, eq. 8).
+    """Return the equivalent degrees of freedom of a variance of d-th differences at lag m of phase `points` (Greenhall & Riley 2003).
 
     1 / edf = (s_z(0)^2 + 2 sum_j (1 - j / M) s_z(j / S)^2) / (M s_z(0)^2) over j < min(M, (d + 1) S) for M terms, S of them in one lag.
     """
@@ -79,7 +81,7 @@ def degrees_of_freedom(d: int, modified: bool, overlapped: bool, m: int, points:
     if alpha == 2 and not modified:
         # White phase: terms are alike only where they share a point, that is at whole lags.
         S, M = 1 if not overlapped else m, 1 + (points - span) // (1 if overlapped else m)
-        shared = [(1 - l * S / M) * (comb(2 * d, d + l) / comb(2 * d, d)) ** 2 for l in range(1, d + 1) if l * S < M]
+        shared = [(1 - i * S / M) * (comb(2 * d, d + i) / comb(2 * d, d)) ** 2 for i in range(1, d + 1) if i * S < M]
         return max(M / (1 + 2 * sum(shared)), 1.0)
     S = min(m, _FINE) if overlapped else 1
     spans = (points - span) / m  # how far the first and last term are apart, in lags
@@ -87,9 +89,8 @@ def degrees_of_freedom(d: int, modified: bool, overlapped: bool, m: int, points:
     filtered = 1 if modified else min(m, _FINE)
     z = _correlations(alpha, d, filtered, S)
     j = np.arange(min(M, (d + 1) * S))
-    z0 = z[0] + (
-        comb(2 * d, d) * 2 * np.log(m / filtered) if alpha == 1 and not modified else 0.0
-    )  # flicker phase never forgets the factor
+    # Flicker phase never forgets the averaging factor: s_x(0) = 2 log F.
+    z0 = z[0] + (comb(2 * d, d) * 2 * np.log(m / filtered) if alpha == 1 and not modified else 0.0)
     sum_squares = z[0] ** 2 + 2 * np.sum((1 - j[1:] / M) * z[j[1:]] ** 2)
     return max(float(M * z0**2 / sum_squares), 1.0)
 

@@ -40,6 +40,9 @@ COLUMNS: dict[str, tuple[Dtype, tuple[int, ...]]] = {
     "kept": ("bool", ()),
     "distance": ("float64", ()),
     "tilt": ("float64", ()),
+    "axis": ("int32", ()),
+    **dict.fromkeys(("tau", "deviation", "fitted", "low", "high"), ("float64", ())),
+    "attitude": ("float64", (3,)),
 }
 
 ArrayName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
@@ -73,15 +76,21 @@ class _Header(BaseModel):
 
 
 def entry_hashes(rig: Rig) -> dict[str, str]:
-    """Return the sha256 of every entry of the rig by key (`cameras.cam0`), without what may be renamed by hand: topic and equation."""
+    """Return the sha256 of every entry of the rig by key (`cameras.cam0`), without what may be renamed by hand: topic and equation.
+
+    An IMU is two entries: its noise and its intrinsics come from different stages.
+    """
+    renamed = {"topic", "equation"}
     entries = {
-        f"{section}.{name}": entry
-        for section in ("cameras", "imus", "transforms", "time_offsets")
+        f"{section}.{name}": entry.model_dump(mode="json", exclude=renamed)
+        for section in ("cameras", "transforms", "time_offsets")
         for name, entry in getattr(rig, section).items()
     }
-    texts = {
-        key: json.dumps(entry.model_dump(mode="json", exclude={"topic", "equation"}), sort_keys=True) for key, entry in entries.items()
-    }
+    for name, imu in rig.imus.items():
+        entries[f"imus.{name}.noise"] = imu.model_dump(mode="json", exclude={*renamed, "intrinsics"})
+        if imu.intrinsics is not None:
+            entries[f"imus.{name}.intrinsics"] = imu.intrinsics.model_dump(mode="json", exclude=renamed)
+    texts = {key: json.dumps(entry, sort_keys=True) for key, entry in entries.items()}
     return {key: hashlib.sha256(text.encode()).hexdigest() for key, text in texts.items()}
 
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibkit.report.field import cells, grid, over_image, over_radius
+from calibkit.report.imu_figures import allan, stands
 from calibkit.report.signals import frame_tilts
 from calibkit.report.view import View, given
 
@@ -202,4 +203,12 @@ PICTURES = (
             "About one height from frame to frame is good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or "
             "mount that drifts.",
             _PIXELS | {"frame"}, 2.6, _frames),
+    Picture("allan", "Allan deviation",
+            "Points on the line, within their band, are good: the noise is white (falling), flicker (flat) and a random walk (rising); "
+            "dotted: their slopes. A bump is something else: vibration, temperature, a filter.",
+            frozenset({"axis", "tau", "deviation", "fitted", "low", "high"}), 4.2, allan),
+    Picture("stands", "Stands",
+            "Residuals of one size without a trend are good, and attitudes all over both discs: where none is, scale and misalignment "
+            "hang on the others.",
+            frozenset({"attitude"}), 3.2, stands),
 )  # fmt: skip

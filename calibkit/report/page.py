@@ -12,7 +12,7 @@ from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import draw
 from calibkit.report.parameters import SIGMA_NOTE
-from calibkit.report.summary import Summary, as_json, camera_lines
+from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines
 from calibkit.version import __version__
 
 MEANING = {
@@ -36,7 +36,7 @@ def build(summary: Summary) -> dict[str, bytes]:
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
-        cameras=camera_lines(summary),
+        told=[*camera_lines(summary), *stage_lines(summary)],
         meaning=MEANING[summary.verdict],
         sections=sections,
         thumbnails=thumbnails,

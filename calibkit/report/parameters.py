@@ -6,10 +6,11 @@ from math import degrees, floor, log10
 
 import numpy as np
 
-from calibkit.data.rig import Camera, Estimate, Imu, Rig, TimeOffset, Transform
+from calibkit.data.rig import Camera, Estimate, Imu, Noise, Rig, TimeOffset, Transform
 from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
+from calibkit.report.imu_units import for_people
 
 SIGMA_NOTE = (
     "sigma is one standard deviation, plain takes corners as independent; factor is their ratio: it covers errors that neighbouring "
@@ -80,7 +81,16 @@ def rows(rig: Rig) -> list[Row]:
             estimate = getattr(imu, key)
             if isinstance(estimate, Estimate):
                 out.append(_row(name, key, estimate))
+        for axis, noise in imu.noise.items():
+            out += [_noise_row(name, axis, key, getattr(noise, key)) for key in Noise.model_fields if getattr(noise, key) is not None]
+        if imu.intrinsics is not None:
+            out += [_row(name, key, estimate) for key, estimate in imu.intrinsics.parameters.items()]
     return out
+
+
+def _noise_row(imu: str, axis: str, coefficient: str, estimate: Estimate) -> Row:
+    note = "" if estimate.value is None else for_people(axis[:-2], coefficient, estimate.value)
+    return _row(imu, f"{axis} {coefficient}", estimate, note)
 
 
 def _row(part: str, name: str, estimate: Estimate, note: str = "") -> Row:
@@ -127,7 +137,8 @@ def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
             out.append(Reason(entry.verdict, f"{part}: its stage judged it {entry.verdict.value}"))
     gone: dict[str, list[str]] = {}
     for row in rows(rig):
-        if row.status is Status.NOT_OBSERVABLE:
+        said = any("not observable" in text and text.startswith(f"{row.part}:") and row.name in text for text in heard)
+        if row.status is Status.NOT_OBSERVABLE and not said:
             gone.setdefault(row.part, []).append(row.name)
     out += [Reason(Verdict.FAIL, f"{part}: not observable in this recording: {', '.join(names)}") for part, names in gone.items()]
     return tuple(out)

@@ -59,7 +59,8 @@ def _says(reason: Reason, name: str) -> bool:
 
 def text(summary: Summary) -> str:
     """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
-    lines = [*camera_lines(summary), ""] if summary.rig.cameras else []
+    told = [*camera_lines(summary), *stage_lines(summary)]
+    lines = [*told, ""] if told else []
     lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
     if any(row.factor for row in summary.parameters):
         lines.append(f"{SIGMA_NOTE}\n")
@@ -69,6 +70,12 @@ def text(summary: Summary) -> str:
     lines.append(f"{summary.verdict.value}")
     lines += [f"  {reason.verdict.value:5} {one_line(reason.text, 1000)}" for reason in summary.reasons]
     return "\n".join(lines)
+
+
+def stage_lines(summary: Summary) -> list[str]:
+    """Return what the stages say of their recordings in lines of their own."""
+    found = [result.facts.get("lines") for result in summary.results]
+    return [one_line(line, 1000) for lines in found if isinstance(lines, list) for line in lines]
 
 
 def camera_lines(summary: Summary) -> list[str]:

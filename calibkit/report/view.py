@@ -1,7 +1,7 @@
 """One residual set made ready to be read: rows with a prediction only, frames numbered and named, the image they lie in."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.result import ResidualSet, Result
+from calibkit.data.rig import ImuAxis, Noise
 from calibkit.errors import one_line
 
 Array = NDArray[np.float64]
@@ -35,6 +36,15 @@ class View:
     image_size: tuple[int, int] | None = None  # width, height px
     centre: Array | None = None  # (2,) px, principal point, else the middle of the image
     held_out_rms: float | None = None
+    axis: Index | None = None  # (n,) index into the names that the stage gives
+    tau: Array | None = None  # (n,) s
+    deviation: Array | None = None  # (n,) measured Allan deviation in `units` of its axis
+    fitted: Array | None = None  # (n,) the noise model's
+    low: Array | None = None  # (n,) 95 % interval
+    high: Array | None = None
+    attitude: Array | None = None  # (n, 3) unit vector of gravity's reaction in the IMU's frame
+    time: Array | None = None  # (n,) s from the first row
+    noise: Mapping[ImuAxis, Noise] = field(default_factory=dict)  # of an IMU, by axis
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
     @property
@@ -82,7 +92,11 @@ def _view(result: Result, residuals: ResidualSet) -> View:
     def column(key: str) -> NDArray[np.generic] | None:
         return context[key][good] if key in context else None
 
-    kept, corner, tilt = column("kept"), column("corner"), column("tilt")
+    def floats(key: str, width: int | None = None) -> Array | None:
+        found = column(key)
+        return None if found is None or (width and found.shape[1:] != (width,)) else found.astype(float)
+
+    kept, corner, tilt, axis = column("kept"), column("corner"), column("tilt"), column("axis")
     uv = column("uv") if residuals.raw.shape[1] == 2 else None
     frame, labels = _frames(result.facts, residuals.sensor, column("frame"))
     size = camera.resolution if camera else None
@@ -106,6 +120,15 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         centre=centre,
         held_out_rms=camera.reprojection.held_out_rms_px if camera and camera.reprojection else None,
         n_lost=int(np.sum(~good)),
+        noise=result.rig.imus[residuals.sensor].noise if residuals.sensor in result.rig.imus else {},
+        axis=None if axis is None else axis.astype(np.intp),
+        tau=floats("tau"),
+        deviation=floats("deviation"),
+        fitted=floats("fitted"),
+        low=floats("low"),
+        high=floats("high"),
+        attitude=floats("attitude", 3),
+        time=(residuals.t_ns[good] - residuals.t_ns[good].min()) / 1e9 if good.any() and residuals.t_ns.any() else None,
     )
 
 

@@ -1,0 +1,122 @@
+"""`calibkit allan`: hours of an IMU at rest to the noise of its axes."""
+
+import csv
+import io
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.observations import ImuSamples
+from calibkit.data.progress import Progress, silent
+from calibkit.data.rig import Imu, ImuAxis
+from calibkit.errors import BadInputError
+from calibkit.estimation.allan import Deviation, deviation, log_spaced
+from calibkit.estimation.imu_noise import AxisNoise, fit_noise
+from calibkit.estimation.imu_screening import clean, rate_hz, screen
+from calibkit.estimation.noise_result import AXES, Rest, noise_result
+from calibkit.io.atomic import refuse_unwritable, write_atomic
+from calibkit.io.imu_options import ImuOptions
+from calibkit.stages.imu_source import open_imu
+from calibkit.stages.outputs import Outputs, Saved, save
+
+Array = NDArray[np.float64]
+
+KINDS = ("overlapping", "modified", "hadamard")
+_DEFAULT = ImuOptions()
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to read the recording and what of it to show."""
+
+    imu: str | None = None  # topic, or NAME=/topic
+    reading: ImuOptions = _DEFAULT
+    kind: str = "overlapping"  # of the deviations shown; the noise is fitted to the recording itself
+    exact: bool = False
+    cut: bool = True  # leave out what spoils the recording
+    table: Path | None = None  # CSV of the deviations
+    ros_distro: str | None = None
+
+
+def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Options | None = None, progress: Progress = silent) -> Saved:
+    """Estimate the noise of an IMU from a recording of it at rest.
+
+    BadInputError names the file, topic or option that is wrong, or that the recording moves throughout.
+    """
+    outputs, options = outputs or Outputs(), options or Options()
+    if options.kind not in KINDS:
+        raise BadInputError(f"--kind {options.kind}: choose one of {', '.join(KINDS)}")
+    base = outputs.open()
+    if options.table is not None:
+        refuse_unwritable(options.table, outputs.force)
+    source = open_imu(sources, options.imu, options.reading, options.ros_distro, progress, counts=False, partial=True)
+    findings = screen(source.samples)
+    moving = next((finding for finding in findings if finding.kind == "moving"), None)
+    if moving is not None:
+        raise BadInputError(f"{source.recording.name}: {source.topic}: {moving.text}")
+    pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
+    axes = [
+        axis for sensor, has in (("gyro", source.samples.has_gyro), ("accel", source.samples.has_accel)) if has for axis in AXES[sensor]
+    ]
+    rate = rate_hz(source.samples.t_ns)
+    noise = dict(zip(axes, _fit(pieces, rate, progress), strict=True))
+    longest = max(pieces, key=lambda piece: len(piece.t_ns))
+    curve = _deviation(longest, rate, "overlapping", options.exact)
+    hours = [_hours(piece, rate) for piece in pieces]
+    rest = Rest(source.name, source.topic, rate, axes, noise, curve, findings, hours, _hours(source.samples, rate))
+    result = noise_result(rest, base.imus.get(source.name, Imu()), options.cut)
+    result = replace(result, facts={**result.facts, "warnings": source.recording.warnings})
+    saved = save(result, base, outputs, source.recording.inputs(), _told(options))
+    if options.table is None:
+        return saved
+    shown = curve if options.kind == "overlapping" else _deviation(longest, rate, options.kind, options.exact)
+    write_atomic(options.table, _csv(shown, axes), outputs.force)
+    return replace(saved, files=(*saved.files, options.table))
+
+
+def _channels(samples: ImuSamples) -> Array:
+    return np.hstack([samples.gyro, samples.accel])
+
+
+def _fit(pieces: Sequence[ImuSamples], rate: float, progress: Progress) -> list[AxisNoise]:
+    """Return the noise of every axis, two at a time: most of the work frees the interpreter's lock."""
+    channels = [_channels(piece) for piece in pieces]
+    n = channels[0].shape[1]
+    with ThreadPoolExecutor() as pool:
+        found = pool.map(lambda axis: fit_noise([x[:, axis : axis + 1] for x in channels], rate)[0], range(n))
+        return list(progress(found, "noise of each axis", n))
+
+
+def _deviation(samples: ImuSamples, rate: float, kind: str, exact: bool) -> Deviation:
+    x = _channels(samples)
+    return deviation(x, rate, log_spaced(len(x), rate), kind, exact)
+
+
+def _hours(samples: ImuSamples, rate: float) -> float:
+    return len(samples.t_ns) / rate / 3600
+
+
+def _csv(curve: Deviation, axes: Sequence[ImuAxis]) -> str:
+    """Return the table of deviations in SI: one line an averaging time, of each axis the deviation and its 95 % interval."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["tau [s]", *(f"{axis} {part}" for axis in axes for part in ("deviation", "low", "high"))])
+    for k, tau in enumerate(curve.tau):
+        values = np.stack([curve.dev[k], curve.lower[k], curve.upper[k]], axis=1).ravel()
+        writer.writerow([f"{tau:.9g}", *(f"{value:.6e}" for value in values)])
+    return out.getvalue()
+
+
+def _told(options: Options) -> dict[str, str | float | int | bool | None]:
+    reading = options.reading
+    return {
+        "rate_hz": reading.rate_hz,
+        "gyro_unit": reading.gyro_unit,
+        "accel_unit": reading.accel_unit,
+        "kind": options.kind,
+        "cut": options.cut,
+    }

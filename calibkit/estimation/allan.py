@@ -54,10 +54,6 @@ class _Kind:
     reflected: bool = False
     time: bool = False
 
-    @property
-    def thinnable(self) -> bool:
-        return self.overlapped and not self.reflected
-
 
 KINDS = {
     "overlapping": _Kind(2, False, 2.0),
@@ -100,27 +96,17 @@ def deviation(
     n = len(x)
     m = _lags(log_spaced(n, rate_hz) if tau is None else np.atleast_1d(np.asarray(tau, np.float64)), rate_hz, n, of)
     strides = np.ones_like(m)
-    if of.thinnable and not exact:
+    thin = not exact and of.overlapped and not of.reflected
+    if thin:
         strides = _strides(m, _terms(m, n, of), of)
         grid = np.where(strides > 1, 2 * strides, 1)
         m = np.round(m / grid).astype(np.int64) * grid
         keep = (_terms(m, n, of) > 0) & (np.diff(m, prepend=0) > 0)
         m, strides = m[keep], strides[keep]
 
-    def channel(j: int) -> tuple[Array, Ints]:
-        phase = _centred(x[:, j])
-        short = np.full(len(m), np.nan)
-        if of.thinnable and not exact and not of.modified:
-            within = m * of.order <= SPAN
-            short[within] = short_squares(phase[1:], m[within], of.order) / _terms(m[within], n, of)
-        np.cumsum(phase, out=phase)
-        return np.where(np.isnan(short), _mean_squares(phase, m, strides, of, np.isnan(short)), short), noise_exponents(
-            phase, m, of.order - of.modified
-        )
-
     # The channels are the threads; BLAS's own would only fight with them.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        found = list(pool.map(channel, range(x.shape[1])))
+        found = list(pool.map(lambda rates: _channel(rates, m, strides, of, thin), x.T))
     seconds, alpha = m / rate_hz, np.stack([a for _, a in found], axis=1)
     dev = np.sqrt(np.stack([s for s, _ in found], axis=1) / of.divisor) / (m**2 if of.modified else m)[:, None]
     if of.time:
@@ -182,17 +168,28 @@ def _centred(rates: Array) -> Array:
     return phase
 
 
-def _mean_squares(phase: Array, m: Ints, strides: Ints, of: _Kind, wanted: NDArray[np.bool_]) -> Array:
-    """Return the mean square of the p-th differences of one channel at each lag that is wanted."""
-    result = np.empty(len(m))
-    if of.reflected:
-        middle = len(phase) - 2
-        longer = np.concatenate([2 * phase[0] - phase[-2:0:-1], phase, 2 * phase[-1] - phase[-2:0:-1]])
-        for k, lag in enumerate(m.tolist()):
-            result[k] = squares(longer[middle + 1 - lag : 2 * middle + 1 + lag], m[k : k + 1], of.order)[0] / middle
-        return result
+def _channel(rates: Array, m: Ints, strides: Ints, of: _Kind, thin: bool) -> tuple[Array, Ints]:
+    """Return the mean squares of one channel's p-th differences at each lag, and the noise found there."""
+    phase = _centred(rates)
+    result = np.full(len(m), np.nan)
+    if thin and not of.modified:
+        short = m * of.order <= SPAN
+        result[short] = short_squares(phase[1:], m[short], of.order) / (len(phase) - of.order * m[short])
+    np.cumsum(phase, out=phase)
+    alpha = noise_exponents(phase, m, of.order - of.modified)
     series = np.cumsum(np.concatenate([[0.0], phase - phase.mean()])) if of.modified else phase
+    if of.reflected:
+        return _reflected_mean_squares(series, m), alpha
     if not of.overlapped:
-        return np.array([np.mean(np.diff(series[::lag], of.order) ** 2) for lag in m.tolist()])
-    result[wanted] = thinned_mean_squares(series, m[wanted], strides[wanted], of.order)
-    return result
+        return np.array([np.mean(np.diff(series[::lag], of.order) ** 2) for lag in m.tolist()]), alpha
+    left = np.isnan(result)
+    # Terms of phase noise are alike at whole lags only: each that is left out is information lost.
+    result[left] = thinned_mean_squares(series, m[left], np.where(alpha > 0, 1, strides)[left], of.order)
+    return result, alpha
+
+
+def _reflected_mean_squares(phase: Array, m: Ints) -> Array:
+    """Return the mean squares of second differences about every inner point of the phase, which is continued by reflection at its ends."""
+    inner = len(phase) - 2
+    longer = np.concatenate([2 * phase[0] - phase[-2:0:-1], phase, 2 * phase[-1] - phase[-2:0:-1]])
+    return np.array([squares(longer[inner + 1 - lag : 2 * inner + 1 + lag], np.array([lag]), 2)[0] / inner for lag in m.tolist()])

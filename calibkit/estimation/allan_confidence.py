@@ -14,7 +14,9 @@ from scipy.special import gammaincinv
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_POINTS = 30  # averages below which the noise cannot be told, and that of the averaging time before is kept
+# Averages below which that of the averaging time before is kept. Riley & Greenhall ask for 30, but then one white noise in six is taken for
+# another, and intervals of 95 % hold the truth in 86 to 90 % of the runs; with 64 in 93 to 98 %.
+_POINTS = 64
 _ENOUGH = 8192  # averages looked at: the autocorrelation is then known to 0.01, and BLAS starts no threads for a dot product
 _FINE = 128  # from this averaging factor on the sums are those of the continuous limit, where only the ratio of spans matters
 

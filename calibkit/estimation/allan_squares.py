@@ -51,8 +51,8 @@ _DIFFERENCES: dict[int, Callable[[Array, Array, int, int, Array], Array]] = {2: 
 def thinned_mean_squares(p: Array, lags: Ints, strides: Ints, order: int) -> Array:
     """Return the mean squares of the differences of p at ascending lags over every s-th start, s the stride of each (2^k) or finer.
 
-    The starts are taken as two interleaved halves, of period t = 2 s of which the lag is a multiple. Halves that disagree tell that the terms
-    vary too much to be thinned so far (phase noise, or a vibration in step with them): they become one half of the next finer stride's.
+    The starts are taken as two interleaved halves, of period t = 2 s of which the lag is a multiple. Halves that disagree tell that the
+    terms vary too much to be thinned so far (phase noise, or a vibration in step with them): they become one half of the next finer ones.
     """
     mean, even = np.empty(len(lags)), np.zeros(len(lags))
     full = np.flatnonzero(strides == 1)

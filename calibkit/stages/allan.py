@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibkit.data.observations import ImuSamples
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Imu, ImuAxis
-from calibkit.errors import BadInputError
+from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.allan import Deviation, deviation, log_spaced
 from calibkit.estimation.imu_noise import AxisNoise, fit_noise
 from calibkit.estimation.imu_screening import clean, rate_hz, screen
@@ -54,11 +54,14 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     if options.table is not None:
         refuse_unwritable(options.table, outputs.force)
     source = open_imu(sources, options.imu, options.reading, options.ros_distro, progress, counts=False, partial=True)
-    findings = screen(source.samples)
-    moving = next((finding for finding in findings if finding.kind == "moving"), None)
-    if moving is not None:
-        raise BadInputError(f"{source.recording.name}: {source.topic}: {moving.text}")
-    pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
+    try:
+        findings = screen(source.samples)
+        moving = next((finding for finding in findings if finding.kind == "moving"), None)
+        if moving is not None:
+            raise BadInputError(moving.text)
+        pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
+    except BadInputError as error:
+        raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {error}") from None
     axes = [
         axis for sensor, has in (("gyro", source.samples.has_gyro), ("accel", source.samples.has_accel)) if has for axis in AXES[sensor]
     ]

@@ -1,0 +1,199 @@
+"""`calibkit allan` from the command line: recordings of an IMU at rest in, noise out, and one line for every mistake."""
+
+import csv
+import gzip
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from calibkit.cli.main import main
+from calibkit.data.rig import Estimate, Imu, ImuIntrinsics, Rig
+from calibkit.data.verdict import Status, Verdict
+from calibkit.io.rig_file import load_rig, save_rig
+from calibkit.models.imu import ImuModel
+from calibkit.simulation.noise import SimNoise, simulate_noise
+
+Array = NDArray[np.float64]
+
+RATE = 50.0
+GYRO = SimNoise(white=2e-4, flicker=1e-4)
+ACCEL = SimNoise(white=2e-3, flicker=1e-3)
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a run ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def mistake(self) -> str:
+        """The one line of an error that wrote nothing."""
+        lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
+        assert (self.code, self.out, len(lines)) == (2, "", 1), self
+        return lines[0].removeprefix("calibkit: ")
+
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    def calibkit(*arguments: object) -> Said:
+        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        return Said(int(end.value.code or 0), said.out, said.err)
+
+    return calibkit
+
+
+def rest(seconds: float, seed: int = 0) -> Array:
+    """Return samples (n, 6) rad/s, m/s^2 of an IMU that lies still."""
+    rng, n = np.random.default_rng(seed), int(seconds * RATE)
+    noise = np.hstack([simulate_noise(kind, n, RATE, rng, 3) for kind in (GYRO, ACCEL)])
+    return noise + np.array([0.004, -0.003, 0.002, 0.05, -0.03, 9.81])
+
+
+def write(path: Path, samples: Array, units: tuple[str, str] = ("rad/s", "m/s^2"), start_ns: int = 1_700_000_000 * 10**9) -> Path:
+    names = [f"w{a} [{units[0]}]" for a in "xyz"] + [f"a{a} [{units[1]}]" for a in "xyz"]
+    rows = [",".join(["t [ns]", *names])]
+    rows += [f"{start_ns + round(k * 1e9 / RATE)}," + ",".join(f"{v:.7g}" for v in row) for k, row in enumerate(samples)]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("rest") / "imu.csv", rest(1200))
+
+
+def test_rest_in_noise_out(run: Run, recording: Path, tmp_path: Path) -> None:
+    out, report = tmp_path / "rig.yaml", tmp_path / "report"
+    said = run("allan", recording, "-o", out, "--report", report, "--json", tmp_path / "all.json", "--table", tmp_path / "curve.csv")
+    assert said.code == 3, said  # 20 minutes do not tell a random walk that is not there
+    rig = load_rig(out)
+    imu = rig.imus["imu0"]
+    assert imu.rate_hz == pytest.approx(RATE)
+    for axis in ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"):
+        white, truth = imu.noise[axis].white, GYRO.white if axis.startswith("gyro") else ACCEL.white
+        assert white.value is not None
+        assert white.sigma is not None
+        assert abs(white.value - truth) < 4 * white.sigma
+        assert white.sigma < 0.02 * truth
+        assert imu.noise[axis].walk.status is Status.NOT_OBSERVABLE
+    assert imu.gyro_noise_density is not None
+    assert imu.gyro_noise_density.value == pytest.approx(np.sqrt(np.mean([imu.noise[f"gyro_{a}"].white.value ** 2 for a in "xyz"])))
+    assert imu.gyro_random_walk is not None
+    assert imu.gyro_random_walk.value is None
+    assert imu.verdict is Verdict.FAIL
+    assert "gyro_x walk (K) is not observable in this recording" in said.out
+    assert " h needed to tell " in said.out
+    assert "deg/sqrt(h)" in said.out
+    assert {path.name for path in report.iterdir()} >= {"report.html", "report.json", "imu0-allan-allan.png"}
+    data = json.loads((tmp_path / "all.json").read_text())
+    assert data["facts"]["allan"]["axes"]["gyro_x"]["walk"]["upper95"] > 0
+    with (tmp_path / "curve.csv").open() as stream:
+        table = list(csv.reader(stream))
+    assert table[0][:4] == ["tau [s]", "gyro_x deviation", "gyro_x low", "gyro_x high"]
+    at_1_s = min(table[1:], key=lambda row: abs(np.log(float(row[0]))))
+    assert float(at_1_s[1]) * np.sqrt(float(at_1_s[0])) == pytest.approx(GYRO.white, rel=0.15)
+    again = run("report", out)
+    assert again.code == 1
+    assert "accel_z walk" in again.out
+
+
+def test_export_gives_kalibr_what_is_known_and_refuses_what_is_not(run: Run, recording: Path, tmp_path: Path) -> None:
+    assert run("allan", recording, "-o", tmp_path / "rig.yaml").code == 3
+    said = run("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "kalibr")
+    assert "random_walk" in said.mistake
+    assert "not observable" in said.mistake
+
+
+def test_noise_is_added_to_what_a_rig_file_knows(run: Run, recording: Path, tmp_path: Path) -> None:
+    values = {name: Estimate(value=value) for name, value in ImuModel().values().items()}
+    before = Rig(imus={"imu0": Imu(topic="/imu", intrinsics=ImuIntrinsics(gravity=9.81, parameters=values)), "imu1": Imu(rate_hz=100.0)})
+    path = tmp_path / "rig.yaml"
+    save_rig(before, path)
+    assert run("allan", recording, "--rig", path, "-o", path).code == 3
+    after = load_rig(path)
+    assert after.imus["imu0"].intrinsics == before.imus["imu0"].intrinsics
+    assert after.imus["imu0"].noise
+    assert after.imus["imu1"] == before.imus["imu1"]
+
+
+def test_units_and_gzip_and_no_times(run: Run, tmp_path: Path) -> None:
+    samples = rest(300)
+    run("allan", write(tmp_path / "si.csv", samples), "-o", tmp_path / "si.yaml")
+    people = samples * np.repeat([180 / np.pi, 1 / 9.80665], 3)
+    body = "\n".join(
+        [",".join(["gx [deg/s]", "gy [deg/s]", "gz [deg/s]", "ax [g]", "ay [g]", "az [g]"])]
+        + [",".join(f"{v:.9g}" for v in row) for row in people]
+    )
+    (tmp_path / "people.csv.gz").write_bytes(gzip.compress(body.encode()))
+    assert "--rate" in run("allan", tmp_path / "people.csv.gz").mistake
+    run("allan", tmp_path / "people.csv.gz", "--rate", RATE, "-o", tmp_path / "people.yaml")
+    si, others = (load_rig(tmp_path / f"{name}.yaml").imus["imu0"].noise for name in ("si", "people"))
+    for axis, noise in si.items():
+        assert others[axis].white.value == pytest.approx(noise.white.value, rel=1e-4)
+
+
+def test_what_spoils_a_recording_is_named_and_cut(run: Run, tmp_path: Path) -> None:
+    samples = rest(600)
+    t = np.arange(len(samples)) / RATE
+    knock = (t > 200) & (t < 203)
+    samples[knock] += 0.5 * np.sin(40 * t[knock])[:, None]
+    said = run("allan", write(tmp_path / "knocked.csv", samples), "-o", tmp_path / "rig.yaml")
+    assert "motion" in said.out
+    assert "cut out" in said.out
+    white = load_rig(tmp_path / "rig.yaml").imus["imu0"].noise["gyro_x"].white
+    assert white.value == pytest.approx(GYRO.white, rel=0.03)
+    kept = run("allan", tmp_path / "knocked.csv", "--no-cut")
+    assert "cut out" not in kept.out
+
+
+def test_mistakes_are_one_line(run: Run, recording: Path, tmp_path: Path) -> None:
+    moving = rest(120)
+    moving += 0.3 * np.sin(np.arange(len(moving)) / RATE * np.array([[2.0], [3.1], [0.7], [1.3], [2.2], [0.9]])).T
+    assert "not at rest" in run("allan", write(tmp_path / "moving.csv", moving)).mistake
+    holes = write(tmp_path / "holes.csv", rest(60))
+    holes.write_text("t [ns],wx,wy,wz,ax,ay,az\n" + "\n".join(f"{k},nan,nan,nan,nan,nan,nan" for k in range(100)))
+    assert "holes.csv" in run("allan", holes).mistake
+    (tmp_path / "poses.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n")
+    assert "no imu topic" in run("allan", tmp_path / "poses.csv").mistake
+    other = write(tmp_path / "imu_b.csv", rest(60, seed=1))
+    assert "which imu topic" in run("allan", recording, other).mistake
+    assert "--kind parabolic" in run("allan", recording, "--kind", "parabolic").mistake
+    assert "absent.csv" in run("allan", tmp_path / "absent.csv").mistake
+    out = tmp_path / "there.yaml"
+    out.write_text("")
+    assert "--force" in run("allan", recording, "-o", out).mistake
+    assert "write imu0=/topic" in run("allan", recording, "--imu", "=x").mistake
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_too_short_a_recording_says_what_it_cannot_tell(run: Run, tmp_path: Path) -> None:
+    said = run("allan", write(tmp_path / "short.csv", rest(20)), "-o", tmp_path / "rig.yaml")
+    assert said.code == 3
+    assert "lasts 20 s" in said.out.replace("19.98", "20")
+    noise = yaml.safe_load((tmp_path / "rig.yaml").read_text())["imus"]["imu0"]["noise"]["gyro_x"]
+    assert noise["flicker"]["value"] is None
+    assert noise["walk"]["value"] is None
+    assert noise["white"]["value"] == pytest.approx(GYRO.white, rel=0.15)
+
+
+def test_degrees_taken_for_radians_and_g_for_metres_are_told(run: Run, tmp_path: Path) -> None:
+    wrong = rest(120) * np.repeat([180 / np.pi, 1 / 9.80665], 3)
+    said = run("allan", write(tmp_path / "wrong.csv", wrong))
+    assert "CHECK imu0: " in said.out
+    assert "--accel-unit g" in said.out

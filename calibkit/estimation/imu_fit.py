@@ -1,15 +1,16 @@
 """From samples to the fitted problem: first guess, robust fit, what is dropped, weights by likelihood, final fit."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from calibkit.errors import NotConvergedError
-from calibkit.estimation.imu_problem import State, StandProblem, Weights
+from calibkit.estimation.imu_problem import StandProblem, State, Weights
 from calibkit.estimation.imu_seed import AccelSeed, seed_accel, seed_gyro
 from calibkit.estimation.imu_turns import Turns
-from calibkit.estimation.imu_weights import find_weights
+from calibkit.estimation.imu_weights import USUAL, find_weights
 from calibkit.estimation.static_intervals import Stands
 from calibkit.solver.levenberg_marquardt import minimise
 
@@ -19,9 +20,10 @@ Mask = NDArray[np.bool_]
 _ROBUST = 3.0  # sigmas, Cauchy
 _OUTLIER = 5.0  # sigmas
 _ROUNDS = 4
-_FIRST = Weights(misfit=1e-3, wobble=1e-3, turn=5e-3, walk_accel=1e-5, walk_gyro=1e-7)
+_ROUGHLY, _EXACTLY = 1e-4, 1e-7  # of the cost: what another step must promise
+_FIRST = replace(USUAL, misfit=1e-3, wobble=1e-3, turn=5e-3)
 _GAP = 5.0  # median intervals: a turn is not integrated across
-_PRIOR = np.array([0.3] * 6 + [3.0] * 3 + [1.0] * 9 + [1.0] * 3 + [0.3] * 9)
+_PRIOR = np.array([0.1] * 6 + [3.0] * 3 + [0.3] * 9 + [1.0] * 3 + [0.3] * 9)
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class ImuFit:
 
     problem: StandProblem
     state: State
+    converged: bool  # False also where a direction is open: there is no one minimum then
     guess: Guess
     stands: Stands
     used: Mask  # (all stands,)
@@ -59,33 +62,34 @@ class ImuFit:
 
 def fit_imu(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
     """Return the joint maximum likelihood estimate; stands and turns that contradict the others by 5 sigma are left out."""
+    with threadpool_limits(1, user_api="blas"):  # the matrices are small: threads cost more than they bring
+        return _fit(samples, stands, sensitivity)
+
+
+def _fit(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
     guess = _guess(samples, stands)
-    used, why, bad_turns = np.ones(len(stands), bool), {}, set()
-    x: State | None = None
-    weights = _FIRST
+    used, why = np.ones(len(stands), bool), dict[int, str]()
+    bad_turns: set[tuple[int, int]] = set()
+    problem = _problem(samples, stands, guess, used, bad_turns, sensitivity)
+    x = _first_fit(problem)
+    problem = problem.weighted(_robust_weights(problem, x))
     for _ in range(_ROUNDS):
-        problem = replace(_problem(samples, stands, guess, used, bad_turns, sensitivity), weights=weights)
-        x = _restart(problem, x, guess, stands, used)
-        x = _solve(replace(problem, robust=_ROBUST), x)
-        weights = _robust_weights(problem, x)
-        x = _solve(replace(problem.weighted(weights), robust=_ROBUST), x)
-        found = _outliers(problem.weighted(weights), x, np.flatnonzero(used))
-        if not found[0] and not found[1]:
+        robust = replace(problem, robust=_ROBUST)
+        robust = robust.weighted(find_weights(robust, x))
+        x = minimise(robust, x, tolerance=_ROUGHLY).x
+        moved, bad = _outliers(robust, x, np.flatnonzero(used))
+        problem = replace(robust, robust=np.inf)
+        if not moved and not bad:
             break
-        why.update(found[0])
-        used[list(found[0])] = False
-        bad_turns |= found[1]
-    for _ in range(2):
-        problem = problem.weighted(find_weights(problem, x))
-        x = _solve(problem, x)
-    return ImuFit(problem, x, guess, stands, used, why, tuple(sorted(bad_turns)))
-
-
-def _solve(problem: StandProblem, x: State) -> State:
-    solution = minimise(problem, x, tolerance=1e-7)
-    if not solution.converged:
-        raise NotConvergedError("the IMU's stands and turns fit no scale and axes: check that gyroscope and accelerometer are one device's")
-    return solution.x
+        why.update(moved)
+        used[list(moved)] = False
+        bad_turns |= bad
+        problem = _problem(samples, stands, guess, used, bad_turns, sensitivity).weighted(problem.weights)
+        x = _start(problem, x.theta)
+    problem = problem.weighted(find_weights(problem, x))
+    solution = minimise(problem, x, tolerance=_EXACTLY)
+    x = solution.x
+    return ImuFit(problem, x, solution.converged, guess, stands, used, why, tuple(sorted(bad_turns)))
 
 
 def _guess(samples: Samples, stands: Stands) -> Guess:
@@ -110,9 +114,9 @@ def _problem(
     gap = np.concatenate([[0], np.cumsum(np.diff(samples.t) > _GAP * np.median(np.diff(samples.t)))])
     first, last = kept.last[:-1] - 1, kept.first[1:]
     good = gap[first] == gap[last]
-    good &= [(int(a), int(b)) not in bad_turns for a, b in zip(names[:-1], names[1:], strict=True)]
+    good &= [(int(a), int(b)) not in bad_turns for a, b in pairwise(names)]
     start = np.flatnonzero(good)
-    signal = np.column_stack([rate, np.ones(len(rate)), accel / samples.gravity])
+    signal = np.column_stack([rate, np.ones(len(rate)), *([accel / samples.gravity] if sensitivity else [])])
     turns = Turns.between(samples.t, signal, first[good], last[good])
     way = np.linalg.norm(turns.rate[:, :3], axis=1) * turns.dt
     angle = np.add.reduceat(way, turns.offset) if len(way) else np.zeros(0)
@@ -134,12 +138,17 @@ def _problem(
     )
 
 
-def _restart(problem: StandProblem, x: State | None, guess: Guess, stands: Stands, used: Mask) -> State:
-    """Return where to begin: attitudes as measured, parameters as they are."""
-    up = problem.accel / np.linalg.norm(problem.accel, axis=1, keepdims=True)
-    theta = np.zeros(problem.size) if x is None else x.theta
+def _first_fit(problem: StandProblem) -> State:
+    """Return a robust fit with constant biases: twice, the second time with what the first leaves over for weights."""
+    problem = replace(problem, robust=_ROBUST, walking=False)
+    x = minimise(problem, _start(problem, np.zeros(problem.size)), tolerance=_ROUGHLY).x
+    return minimise(problem.weighted(_robust_weights(problem, x)), x, tolerance=_ROUGHLY).x
+
+
+def _start(problem: StandProblem, theta: Array) -> State:
+    """Return where to begin: attitudes as measured, biases constant."""
     steps = np.zeros((problem.stands - 1, 3))
-    return State(theta, up, steps, steps)
+    return State(theta, problem.accel / np.linalg.norm(problem.accel, axis=1, keepdims=True), steps, steps)
 
 
 def _robust_weights(problem: StandProblem, x: State) -> Weights:
@@ -148,7 +157,8 @@ def _robust_weights(problem: StandProblem, x: State) -> Weights:
     along = np.median(np.linalg.norm(rows.accel, axis=1)) / 0.674 / np.sqrt(max(1 - 9 / problem.stands, 0.1))
     wobble = np.median(np.abs(rows.gyro)) / 0.674
     turn = np.median(np.linalg.norm(rows.turn, axis=1) / np.sqrt(problem.angle)) / 1.18 if len(problem.start) else _FIRST.turn
-    return replace(_FIRST, misfit=max(float(along), 1e-5), wobble=max(float(wobble), 1e-7), turn=max(float(turn), 1e-5))
+    found = {"misfit": along, "wobble": wobble, "turn": turn}
+    return replace(_FIRST, **{name: max(float(value), getattr(USUAL, name)) for name, value in found.items()})
 
 
 def _outliers(problem: StandProblem, x: State, names: NDArray[np.intp]) -> tuple[dict[int, str], set[tuple[int, int]]]:

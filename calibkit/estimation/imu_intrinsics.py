@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
-from calibkit.errors import BadInputError
+from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation.imu_advice import NEEDED_POSITIONS, positions, positions_to_add, turns_missing, what_is_missing
 from calibkit.estimation.imu_fit import Guess, ImuFit, Samples, fit_imu
 from calibkit.estimation.static_intervals import MIN_STANDS, find_stands
@@ -56,6 +56,7 @@ class ImuCalibration:
     names: tuple[str, ...]  # of the covariance: those with a value
     cov: Array  # corrected
     stands: tuple[StandResult, ...]
+    dropped_turns: tuple[tuple[float, float], ...]  # s, begin and end of turns that contradict the others
     multiplier: float  # of the still variance, the threshold that the data chose
     misfit_rms: float  # m/s^2, |a| - g over the stands used
     turn_rms: float  # rad, over the turns used
@@ -106,7 +107,8 @@ def parameters_of(guess: Guess, theta: Array, gravity: float) -> dict[str, float
 def _covariance(fit: ImuFit) -> trust.Covariance:
     """Return the covariance of theta: each stand, with the turn and the walk that follow it, is a block with a score.
 
-    The nuisances are projected out of the whitened Jacobian, J~ = (I - P) J, so that S = sum_b J~_b^T J~_b.
+    The nuisances are projected out of the whitened Jacobian, J~ = (I - P) J, so that S = sum_b J~_b^T J~_b. No sigma comes out below
+    the plain one: the weights are already what the residuals themselves say.
     """
     p, x = fit.problem, fit.state
     r, J = p.whitened(x)
@@ -121,7 +123,7 @@ def _covariance(fit: ImuFit) -> trust.Covariance:
     np.add.at(S, block, left[:, :, None] * left[:, None, :])
     np.add.at(scores, block, left * r[:, None])
     freedom = max(6 * n + 2 * len(p.start) - 2 * n - p.size, 1)
-    return trust.covariance(S, scores, float(r @ r) / freedom, np.full(p.size, 1e-3), least=min(1.0, trust.FEW_BLOCKS / n))
+    return trust.covariance(S, scores, float(r @ r) / freedom, np.full(p.size, 1e-3), least=1.0)
 
 
 def _scales(values: dict[str, float], names: tuple[str, ...], gravity: float) -> Array:
@@ -166,6 +168,8 @@ def _judge(fit: ImuFit, samples: Samples, name: str) -> ImuCalibration:
     sigma = np.sqrt(np.diag(cov))
     statuses = [Status(trust.grade(float(s))) for s in sigma / _scales(values, names, samples.gravity)]
     known = [i for i, status in enumerate(statuses) if status is not Status.NOT_OBSERVABLE]
+    if not fit.converged and len(known) == len(names):
+        raise NotConvergedError(f"{name}: no scale and axes fit its stands and turns; are gyroscope and accelerometer one device's?")
     parameters = {
         n: Number(values[n], float(sigma[i]), float(np.sqrt(plain[i, i])), statuses[i])
         if i in known
@@ -180,6 +184,7 @@ def _judge(fit: ImuFit, samples: Samples, name: str) -> ImuCalibration:
         names=tuple(names[i] for i in known),
         cov=cov[np.ix_(known, known)],
         stands=stands,
+        dropped_turns=tuple((float(fit.stands.end_s[a]), float(fit.stands.start_s[b])) for a, b in fit.dropped_turns),
         multiplier=fit.stands.multiplier,
         misfit_rms=misfit,
         turn_rms=turn,
@@ -228,9 +233,6 @@ def _turns(fit: ImuFit) -> Array:
     return np.add.reduceat(rate, p.turns.offset, axis=0) if len(rate) else np.zeros((0, 3))
 
 
-_SPOKEN = {"M": {True: "scale", False: "axes"}, "b": "bias", "p": "rotation against the accelerometer", "A": "sensitivity to acceleration"}
-
-
 def spoken(parameter: str) -> str:
     """Return a parameter in words: "z scale of the accelerometer (M_a_zz)"."""
     kind, sensor = parameter[0], "accelerometer" if parameter[2] == "a" else "gyroscope"
@@ -242,26 +244,37 @@ def spoken(parameter: str) -> str:
     return f"{words} of the {sensor} ({parameter})"
 
 
+def _listed(bad: list[str]) -> str:
+    if len(bad) <= 3:
+        return ", ".join(spoken(n) for n in bad)
+    sensor = "accelerometer" if bad[0] in ACCEL_PARAMETERS else "gyroscope"
+    return f"{len(bad)} numbers of the {sensor} ({', '.join(bad)})"
+
+
+def _too_few(fit: ImuFit, of_accel: bool) -> str:
+    if of_accel:
+        return f"{fit.problem.stands} stands are too few for errors as large as theirs"
+    return f"{counted(len(fit.problem.start), 'turn')} between stands are too few, each tells two numbers"
+
+
 def _reasons(fit: ImuFit, parameters: dict[str, Number], advice: tuple[str, ...], misfit: float, gravity: float, name: str) -> list[Reason]:
     why = what_is_missing(fit.state.up)
     remedy = f"; add {advice[0]}" if advice else ""
-    reasons = []
+    reasons: list[Reason] = []
     for status, verdict in ((Status.NOT_OBSERVABLE, Verdict.FAIL), (Status.WEAK, Verdict.CHECK)):
         for of_accel in (True, False):
             bad = [n for n, number in parameters.items() if number.status is status and (n in ACCEL_PARAMETERS) == of_accel]
             if not bad:
                 continue
-            cause = "; ".join(why) or "the stands are too few for their errors" if of_accel else "the turns between the stands do not tell"
-            word = "not observable" if status is Status.NOT_OBSERVABLE else "weak"
-            reasons.append(
-                Reason(verdict, f"{name}: {', '.join(spoken(n) for n in bad)} {'is' if len(bad) == 1 else 'are'} {word}: {cause}{remedy}")
-            )
+            cause = "; ".join(why if of_accel else turns_missing(_turns(fit))) or _too_few(fit, of_accel)
+            verb = "is" if len(bad) == 1 else "are"
+            reasons.append(Reason(verdict, f"{name}: {_listed(bad)} {verb} {status.value}: {cause}{'' if reasons else remedy}"))
     if len(positions(fit.state.up)) < NEEDED_POSITIONS and not reasons:
         reasons.append(Reason(Verdict.CHECK, f"{name}: {why[-1]}{remedy}"))
     first = fit.stands
     still = float(first.end_s[0] - first.start_s[0]) if first.start_s[0] < 1.0 else 0.0
     if still < STILL_START_S:
-        text = f"the recording does not begin with {STILL_START_S:.0f} s at rest (but {still:.0f} s): the gyroscope's bias is from the stands alone"
+        text = f"the gyroscope does not begin with {STILL_START_S:.0f} s at rest (but {still:.0f} s): its bias is the stands' alone"
         reasons.append(Reason(Verdict.CHECK, f"{name}: {text}"))
     if len(fit.why) > _MANY_DROPPED * len(first):
         reasons.append(Reason(Verdict.CHECK, f"{name}: {len(fit.why)} of {len(first)} stands contradict the others and were left out"))

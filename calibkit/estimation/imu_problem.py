@@ -72,7 +72,7 @@ class StandProblem:
     cov_accel: Array  # (n, 3, 3)
     gyro: Array  # (n, 3) w0
     cov_gyro: Array  # (n, 3, 3)
-    turns: Turns  # of (w0, 1, a / g)
+    turns: Turns  # of (w0, 1), and a / g where H is asked for
     start: Index  # (m,) stand before the turn
     end: Index  # (m,)
     white_gyro: float  # rad/s/sqrt(Hz)
@@ -81,6 +81,7 @@ class StandProblem:
     size: int  # p
     prior: Array  # (p,) sigma about the first guess: only for what the recording leaves open
     robust: float = np.inf  # sigmas
+    walking: bool = True  # False: constant biases, for the first fits
 
     @property
     def stands(self) -> int:
@@ -127,11 +128,11 @@ class StandProblem:
             J_gyro[:, :, core + 21 :] = -np.einsum("rk,ic->irkc", one, x.up).reshape(n, 3, 9)
         gyro = -(self.gyro @ (one + E).T - k - x.up @ H.T - walk_gyro)
 
-        A = np.column_stack([one + E, -k, -H])
+        A = np.column_stack([one + E, -k, -H] if self.size > 21 else [one + E, -k])
         W_turn = 0.5 * (W[self.start] + W[self.end])
         rotation = integrate(self.turns, A, 0.5 * (walk_gyro[self.start] + walk_gyro[self.end]))
         v = np.einsum("mji,mj->mi", rotation.R, x.up[self.start])
-        J_A = (hat(v) @ rotation.J).reshape(m, 3, 3, 7)
+        J_A = (hat(v) @ rotation.J).reshape(m, 3, 3, A.shape[1])
         J_turn = np.zeros((m, 3, q))
         np.put_along_axis(
             J_turn, np.broadcast_to(up_columns[self.start][:, None], (m, 3, 2)), np.swapaxes(rotation.R, 1, 2) @ B[self.start], axis=2
@@ -195,6 +196,10 @@ class StandProblem:
         r, J = self.whitened(x)
         cost, w = self.robust_weights(r)
         c = self.core_size
+        if not self.walking:
+            c, measured = 2 * self.stands, len(r) - 6 * (self.stands - 1)
+            J = np.concatenate([J[:measured, :c], J[:measured, self.core_size :]], axis=1)
+            r, w = r[:measured], w[:measured]
         JW = J * w[:, None]
         normal, gradient = JW.T @ J, JW.T @ r
         about = 1 / self.prior**2
@@ -211,7 +216,7 @@ class StandProblem:
         n = self.stands
         dx = core.ravel()
         up = x.up + np.einsum("nij,nj->ni", tangent(x.up), dx[: 2 * n].reshape(n, 2))
-        steps = dx[2 * n :].reshape(2, n - 1, 3)
+        steps = (dx[2 * n :] if self.walking else np.zeros(6 * (n - 1))).reshape(2, n - 1, 3)
         return State(x.theta + border, up / np.linalg.norm(up, axis=1, keepdims=True), x.step_accel + steps[0], x.step_gyro + steps[1])
 
     def weighted(self, weights: Weights) -> "StandProblem":

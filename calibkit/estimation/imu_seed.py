@@ -72,7 +72,7 @@ def seed_gyro(t: Array, gyro: Array, up: Array, use: NDArray[np.bool_]) -> Array
     Linear in K over pieces of about a fifth of a second, the hand's own accelerations taken for chance.
     """
     rate = 1 / float(np.median(np.diff(t)))
-    size = max(int(round(0.2 * rate)), 1)
+    size = max(round(0.2 * rate), 1)
     n = (len(t) - 1) // size
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t)[:, None], axis=0)])
     at = np.arange(n + 1) * size

@@ -39,8 +39,9 @@ class Rotations:
 
 
 def integrate(turns: Turns, A: Array, walk: Array) -> Rotations:
-    """Return R = prod exp((A rate_k - walk) dt_k), walk (m, 3) each turn's own bias, with d phi / d A = sum_k R_k^T J_r(phi_k) dt_k (x) rate_k^T, R_k from step k's end to the turn's.
+    """Return R = prod exp((A rate_k - walk) dt_k), walk (m, 3) each turn's own bias, and its derivative.
 
+    d phi / d A = sum_k R_k^T J_r(phi_k) dt_k (x) rate_k^T, R_k from step k's end to the turn's.
     Neighbours are joined, R = R_1 R_2 and J = R_2^T J_1 + J_2, until one is left: twice the work of the leaves, and no loop over samples.
     """
     phi = (turns.rate @ A.T - np.repeat(walk, turns.count, axis=0)) * turns.dt[:, None]

@@ -76,7 +76,7 @@ def find_stands(t: Array, gyro: Array, accel: Array, gravity: float) -> Stands:
 
 def _variance_ratio(t: Array, gyro: Array, accel: Array) -> Array:
     """Return per sample the variance over the window around it, relative to stillness: the larger of gyroscope and accelerometer."""
-    size = max(int(round(_WINDOW_S / float(np.median(np.diff(t))))), 4)
+    size = max(round(_WINDOW_S / float(np.median(np.diff(t)))), 4)
     ratio = np.zeros(len(t))
     for x in (gyro, accel):
         x = x - np.median(x, axis=0)
@@ -147,7 +147,7 @@ def _covariance_of_means(t: Array, x: Array, first: Index, last: Index, mean: Ar
     Batch means: blocks of a quarter of a second are independent where neighbouring samples are not; a stand's own few blocks are
     shrunk towards those of all. Coarse steps that noise does not dither add their own error (Widrow 1996).
     """
-    per_block = max(int(round(_BLOCK_S / float(np.median(np.diff(t))))), 2)
+    per_block = max(round(_BLOCK_S / float(np.median(np.diff(t)))), 2)
     counts = np.maximum((last - first) // per_block, 1)
     stand = np.repeat(np.arange(len(first)), counts)
     number = np.arange(len(stand)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -5,6 +5,7 @@ stationary increments: its window variances and its differences of levels have o
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,14 @@ Mask = NDArray[np.bool_]
 _WINDOW_S = 0.5
 _LEAST = 32  # samples of a window
 _SIGMAS = 7.0  # of log variance, or of a level difference, above the quiet ones
+_SKEW = 3.0  # at most, upper spread over lower
 _LOUDER = 1.3  # times the quiet variance, at least
 _JOIN_S = 2.0  # disturbances closer together are one
 _SCALES_S = (4.0, 30.0, 240.0)  # over which levels before and after are averaged
 _BLOCKS = 16  # of the test for one drift throughout
 _T_DRIFT = 8.0  # its t value
 _RESTLESS = 5.0  # scatter of window means over what the sample noise makes of them
-_MOVING = (3e-3, 3e-2)  # rad/s, m/s^2: at least this scatter of half-second means is called motion throughout
+_MOVING = (1e-2, 0.1)  # rad/s, m/s^2: at least this scatter of half-second means is called motion throughout
 _MOVING_SHARE = 0.5  # of the windows
 _MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 
@@ -43,6 +45,18 @@ class Windows:
     def step_s(self) -> float:
         """The typical length of a window."""
         return float(np.median(np.diff(self.t_s)))
+
+
+class _Change(NamedTuple):
+    """A change of a level, in windows."""
+
+    first: int  # of the windows that it is judged from
+    last: int
+    drifts: bool
+    begin: int
+    end: int
+    axis: int
+    size: float
 
 
 def windows(t_s: Array, values: dict[str, Array], rate_hz: float, si: bool) -> Windows:
@@ -84,10 +98,11 @@ def _loudness(w: Windows) -> Array:
     """
     floor = np.maximum(w.variance.max(axis=0), np.finfo(float).tiny) * 1e-12
     log = np.log(np.maximum(w.variance, floor))
-    low, high = np.quantile(log, [0.05, 0.2], axis=0)
-    spread = np.maximum((high - low) / 0.803, np.sqrt(2 / w.size))  # normal quantiles -1.645 and -0.842
-    limit = np.maximum(_SIGMAS * spread, np.log(_LOUDER))
-    loudness: Array = (log - (high + 0.842 * spread)) / limit
+    lowest, low, middle, high = np.quantile(log, [0.05, 0.2, 0.5, 0.8], axis=0)
+    spread = np.maximum((low - lowest) / 0.803, np.sqrt(2 / w.size))  # normal quantiles -1.645 and -0.842
+    upward = np.clip((high - middle) / 0.842, spread, _SKEW * spread)  # noise correlated over the window has a long upper tail
+    limit = np.maximum(_SIGMAS * upward, np.log(_LOUDER))
+    loudness: Array = (log - (low + 0.842 * spread)) / limit
     return loudness
 
 
@@ -105,8 +120,7 @@ def _throughout(w: Windows, moved: Mask) -> list[Finding]:
 
 def check_levels(w: Windows, disturbed: Mask) -> list[Finding]:
     """Find steps and ramps of the level that no motion explains, as changes of temperature make them."""
-    found: list[Finding] = []
-    taken = np.zeros(len(w.mean), bool)
+    found: list[_Change] = []
     for scale_s in _SCALES_S:
         half = max(round(scale_s / w.step_s), 1)
         change, known = _change(w.mean, half), ~_any_within(disturbed, 2 * half)
@@ -117,18 +131,19 @@ def check_levels(w: Windows, disturbed: Mask) -> list[Finding]:
         limit = _SIGMAS * (1 + 4 / np.sqrt(np.sum(known) / half)) * spread  # a spread from few is itself uncertain
         excess = np.where(known[:, None], np.abs(change - middle) / limit, 0)
         for first, last in _runs(np.any(excess > 1, axis=1), 2 * half):
-            if taken[first : last + 2 * half].any():
-                continue  # seen at a finer scale
-            taken[first : last + 2 * half] = True
             peak, axis = np.unravel_index(int(np.argmax(excess[first:last])), (last - first, len(w.axes)))
-            size = float(change[first + int(peak), axis])
-            if last - first > 3 * half:
-                found.append(_level_finding(w, "drift", first + half // 2, last + 3 * half // 2, int(axis), size))
-            else:
-                at = first + int(peak)
+            at = first + int(peak)
+            begin, end = first if first == 0 else first + half // 2, min(last + 3 * half // 2, len(w.mean))
+            drifts = last - first > 3 * half  # a step is seen over 2 half at most
+            if not drifts:
                 begin = at + _step_within(w.mean[at : at + 2 * half, axis])
-                found.append(_level_finding(w, "step", begin, begin + 2, int(axis), size))
-    return found + _drift(w)
+                end = begin + 2
+            seen = [c for c in found if c.first < last + 2 * half and first < c.last]
+            if drifts:  # what a finer scale saw was its steepest part
+                found = [c for c in found if c not in seen or not c.drifts]
+            if drifts or not seen:
+                found.append(_Change(first, last + 2 * half, drifts, begin, end, int(axis), float(change[at, axis])))
+    return [_level_finding(w, c) for c in found] + _drift(w)
 
 
 def _change(level: Array, half: int) -> Array:
@@ -150,12 +165,11 @@ def _step_within(x: Array) -> int:
     return int(np.argmax(np.abs(np.cumsum(x - x.mean())[:-1])))
 
 
-def _level_finding(w: Windows, kind: str, begin: int, end: int, axis: int, size: float) -> Finding:
-    verb = "drifts" if kind == "drift" else "steps"
-    end = min(end, len(w.mean))
-    text = f"{w.axes[axis]} {verb} by {size:.3g}{_unit(w, axis)}: a change of temperature, or was it touched?"
+def _level_finding(w: Windows, c: _Change) -> Finding:
+    kind, verb = ("drift", "drifts") if c.drifts else ("step", "steps")
+    text = f"{w.axes[c.axis]} {verb} by {c.size:.3g}{_unit(w, c.axis)}: a change of temperature, or was it touched?"
     # A drift through most of the recording cannot be cut out of it.
-    return Finding(kind, text, float(w.t_s[begin]), float(w.t_s[end]), cut=kind == "step" or end - begin < len(w.mean) / 3)
+    return Finding(kind, text, float(w.t_s[c.begin]), float(w.t_s[c.end]), cut=not c.drifts or c.end - c.begin < len(w.mean) / 3)
 
 
 def _drift(w: Windows) -> list[Finding]:

@@ -20,7 +20,7 @@ _LOUD_GYRO = 3e-3  # rad/s/sqrt(Hz): 4 times the loudest gyroscopes'
 _SEGMENT = 4096  # samples of a spectrum
 _LEAST_SEGMENTS = 4
 _LOW = 8  # bins; below, flicker noise is too steep for a level around each bin
-_AROUND = 32  # bins on both sides, for the level around a line
+_AROUND = 32  # bins on each side, for the level around a line
 _LINE = 3.0  # times the level around, at least
 _CHANCE = 1e-12  # that noise makes a bin a line
 _LINES = 5  # at most
@@ -140,17 +140,27 @@ def check_vibration(axes: dict[str, Array], t_s: Array, rate_hz: float, quiet: M
         for some in np.array_split(cut, max(1, len(cut) // 64)):
             power += np.sum(np.abs(np.fft.rfft((some - some.mean(axis=1, keepdims=True)) * hann, axis=1)) ** 2, axis=0)
         power /= len(cut)
-        around = median_filter(power, 2 * _AROUND + 1, mode="nearest")
-        ratio = np.where(np.arange(len(power)) < _LOW, 0, power / np.maximum(around, 1e-300))
+        below, above = _around(power)
+        ratio = np.where(np.arange(len(power)) < _LOW, 0, power / np.maximum(np.maximum(below, above), 1e-300))  # a slope is no line
         ratio[-2:] = 0  # the Nyquist frequency has half the degrees of freedom
         for peak in np.flatnonzero((ratio > limit) & (ratio >= np.roll(ratio, 1)) & (ratio > np.roll(ratio, -1))).tolist():
             near = slice(max(peak - 3, 0), peak + 4)
-            excess = np.maximum(power[near] - around[near], 0)
+            excess = np.maximum(power[near] - (below[near] + above[near]) / 2, 0)
             # A line of amplitude A leaves (A / 2)^2 sum(hann)^2 in its bin, and A^2 / 4 N sum(hann^2) in all of them.
             amplitude = float(np.sqrt(4 * np.sum(excess) / (_SEGMENT * np.sum(hann**2))))
             centre = float(np.sum(excess * np.arange(near.start, near.stop)[: len(excess)]) / np.sum(excess))
             lines.append((float(ratio[peak]), centre, amplitude, axis))
     return _told_lines(sorted(lines, reverse=True), rate_hz / _SEGMENT, float(t_s[-1]), unit)
+
+
+def _around(power: Array) -> tuple[Array, Array]:
+    """Return the level below and above each bin, as medians."""
+    flat = power.copy()
+    flat[:2] = flat[2]  # what subtracting the mean took away
+    half, apart = _AROUND // 2, 3  # a line itself fills the bins nearest to it
+    medians = median_filter(flat, _AROUND, mode="nearest")  # over k - half .. k + half - 1
+    at = np.arange(len(flat))
+    return medians[np.maximum(at - half - apart, 0)], medians[np.minimum(at + half + apart, len(flat) - 1)]
 
 
 def _told_lines(lines: list[tuple[float, float, float, str]], bin_hz: float, end_s: float, unit: dict[str, str]) -> list[Finding]:

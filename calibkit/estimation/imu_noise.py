@@ -37,6 +37,7 @@ _TERM_SHOWS = 10.83  # gain of the deviance that Q or R must bring: 99.9 % of ch
 _MARKOV_SHOWS = 18.0  # and the Gauss-Markov term: 1.2e-4 of chi-squared with 2, its time being searched for
 _MARKOV_CORNER = 4.0  # its corner frequency lies at least this factor below f_max: what is faster is the sensor's filter
 _MARKOV_STEPS = 20
+_MARKOV_PEAK = 1.89  # tau over correlation time where a Gauss-Markov process shows most (IEEE Std 952, annex C)
 _AVAR = 2 * np.log(2) / np.pi
 
 
@@ -52,6 +53,14 @@ class NoiseTerm:
     hours_needed: float | None = None  # not observable: a recording longer than this resolves `resolves`; inf: none of 1000 h does
     resolves: float | None = None
 
+    @property
+    def advice(self) -> str | None:
+        """Return what to do about a term without a number."""
+        if self.hours_needed is None:
+            return None
+        longer = f"longer than {self.hours_needed:.2g} h" if np.isfinite(self.hours_needed) else "more than a recording of 1000 h"
+        return f"not resolved by this recording: {longer} needed"
+
 
 @dataclass(frozen=True)
 class Markov:
@@ -59,6 +68,11 @@ class Markov:
 
     sigma: float  # its standard deviation, x
     time_s: float  # correlation time
+
+    @property
+    def text(self) -> str:
+        seen = f"a bump in the Allan deviation near tau {_MARKOV_PEAK * self.time_s:.2g} s"
+        return f"exponentially correlated noise of {self.sigma:.2g} over {self.time_s:.2g} s, {seen}; N is that of shorter tau"
 
 
 @dataclass(frozen=True)
@@ -81,7 +95,7 @@ class AxisNoise:
     misfit: tuple[Misfit, ...]
     goodness: float  # probability that a right model fits no better
     discrepancy: float  # relative error of the model's power beyond chance, allowed for in the intervals
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  # what is to be known besides the numbers, in sentences
 
 
 def fit_noise(x: NDArray[np.floating] | Sequence[NDArray[np.floating]], rate_hz: float) -> list[AxisNoise]:
@@ -89,7 +103,11 @@ def fit_noise(x: NDArray[np.floating] | Sequence[NDArray[np.floating]], rate_hz:
 
     Pieces count as independent. Raises BadInputError where x is not finite or shorter than 400 samples.
     """
-    pieces = [np.atleast_2d(np.asarray(p).T).T for p in ([x] if isinstance(x, np.ndarray) else x)]
+    pieces = [x] if isinstance(x, np.ndarray) else list(x)
+    if any(p.ndim != 2 or p.shape[1] != pieces[0].shape[1] for p in pieces):
+        raise BadInputError(f"static rates must be (n, axes), not {' '.join(str(p.shape) for p in pieces[:5])}")
+    if not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise BadInputError(f"the rate must be a positive number of Hz, not {rate_hz}")
     pieces = [p for p in pieces if len(p) >= MIN_SAMPLES]
     if not pieces:
         raise BadInputError(f"too short for a noise model: no piece of {MIN_SAMPLES} samples at rest; record longer")
@@ -173,6 +191,7 @@ def _damped(f: Array, weight: Array, delta: float) -> Array:
 def _axis(s: Spectrum, model: _Model, p: Problem, fit: Fit, unit: float, f_max: float, features: list[Feature], delta: float) -> AxisNoise:
     hours = float(s.durations_s.sum()) / 3600
     found = misfits(p, fit, s)
+    features = [f.scaled(unit) for f in features]
     spans = [interval(p, fit, i) for i in range(len(model.terms))]
     needed = [
         None if span.resolved else hours_to_resolve(fit.theta, spans, model.terms, i, hours, f_max, s.rate_hz)
@@ -200,12 +219,19 @@ def _axis(s: Spectrum, model: _Model, p: Problem, fit: Fit, unit: float, f_max: 
         best=best,
         covariance=variance / (4 * root[:, None] * root) * unit**2,
         f_max=f_max,
-        features=tuple(f.scaled(unit) for f in features),
+        features=tuple(features),
         misfit=tuple(found),
         goodness=goodness(found),
         discrepancy=delta,
-        reasons=(),
+        reasons=tuple(_reasons(features, markov, delta)),
     )
+
+
+def _reasons(features: Sequence[Feature], markov: Markov | None, delta: float) -> list[str]:
+    texts = [f.text for f in features] + ([markov.text] if markov else [])
+    if delta > 0:
+        texts.append(f"the noise terms describe this spectrum to {100 * delta:.2g} % of power only; the intervals allow for that")
+    return texts
 
 
 def _term(span: Interval, unit: float, needed: tuple[float, float] | None) -> NoiseTerm:

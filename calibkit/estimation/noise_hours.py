@@ -16,7 +16,7 @@ _NO_LOW_MODES = (np.zeros((0, 0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
 # Expected gain of the deviance for nine of ten such recordings to resolve the term: (1.96 + 1.28)^2 = 10.5 were its estimate Gaussian, as
 # flicker's nearly is; a walk is seen over a few cycles only, and needs 20 (measured, 40 seeds).
 _RISE = 20.0
-_PART = 1 / 4  # of the present upper limit: the value that the recording asked for is to resolve
+_PART = np.array([0.5, 0.5, 0.25, 0.5])  # of the present upper limit, by term: what is to be resolved; a walk's limit is the loosest
 _STEP = 1.25
 
 
@@ -25,13 +25,14 @@ def hours_to_resolve(
 ) -> tuple[float, float]:
     """Return the hours of recording that resolve coefficient i if it is as large as the recording suggests, and that value.
 
-    The value is what the term has at least by one sigma, or a quarter of its upper limit if that is more.
+    The value is what the term has at least by one sigma, or a half (walk: a quarter) of its upper limit if that is more.
 
     The expected data of such a recording (its power exactly the model's) are fitted without the term (Cowan et al. 2011, the Asimov set);
     what the deviance loses is the expected test statistic. What else is not resolved is taken to be there likewise.
     Infinite where 1000 h do not do.
     """
-    least = np.array([max((_PART * s.upper) ** 2, s.value**2 - 2 * s.value * s.sigma) for s in spans])
+    part = _PART[list(terms)]
+    least = np.array([max((q * s.upper) ** 2, s.value**2 - 2 * s.value * s.sigma) for q, s in zip(part, spans, strict=True)])
     truth = np.where([s.resolved for s in spans], theta[: len(terms)], np.maximum(theta[: len(terms)], least))
     truth[i] = least[i]
     value = float(np.sqrt(least[i]))

@@ -69,15 +69,17 @@ def whitened(p: Problem, fit: Fit) -> Array:
 def _low_modes(p: Problem, theta: Array, ramp: float | None) -> tuple[float, Array, Array, float, float]:
     """Return deviance, score, information, R and its variance of the low modes; R is estimated unless given."""
     W = np.linalg.inv(np.tensordot(p.covariance, theta, (1, 0)))
-    W_ramp = np.einsum("rij,rj->ri", W, p.ramp)
+    W_ramp = (W @ p.ramp[..., None])[..., 0]
     precision = float(np.sum(W_ramp * p.ramp))
     R = float(np.sum(W_ramp * p.low)) / precision if ramp is None else ramp
     e = p.low - R * p.ramp
-    We = np.einsum("rij,rj->ri", W, e)
+    We = (W @ e[..., None])[..., 0]
     WC = W[:, None] @ p.covariance
     flat = WC.swapaxes(0, 1).reshape(len(theta), -1)
     flat_t = WC.swapaxes(2, 3).swapaxes(0, 1).reshape(len(theta), -1)
-    score = 0.5 * (np.einsum("ri,rpij,rj->p", We, p.covariance, We, optimize=True) - np.trace(WC, axis1=2, axis2=3).sum(axis=0))
+    score = 0.5 * (
+        ((p.covariance @ We[:, None, :, None])[..., 0] * We[:, None]).sum(axis=(0, 2)) - np.trace(WC, axis1=2, axis2=3).sum(axis=0)
+    )
     deviance = float(np.sum(e * We)) - float(np.sum(np.linalg.slogdet(W)[1]))
     return deviance, score, 0.5 * flat @ flat_t.T, R, 1 / precision
 

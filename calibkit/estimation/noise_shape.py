@@ -17,11 +17,11 @@ Array = NDArray[np.float64]
 TAU_F = 0.371  # the Allan variance of noise at frequency f is largest at tau = 0.371 / f, where sin^4(pi f tau) / (pi f tau)^2 is
 _OCTAVE = 35  # bands of 2 %
 _LINE_MODES = 30  # bands with fewer modes are too noisy to show a line
-_LINE_SIGMAS, _LINE_EDGE, _LINE_RATIO = 6.0, 3.0, 1.15  # above the octave around it: where found, how far it reaches, and at least
+_LINE_SIGMAS, _LINE_EDGE, _LINE_EXCESS = 6.0, 3.0, 0.14  # above the octave around it: where found, how far it reaches, and at least
 _MARGIN = 1.03
 _HALF = np.sqrt(2.0)
 _CUT_SIGMAS, _CUT_RATIO, _MOST_CUTS, _LEAST_MODES = 4.0, 0.02, 16, 200
-_ENOUGH_DOF = 1e-3
+_FITS = 1e-3  # goodness below which the model is taken to be off
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def find_lines(s: Spectrum) -> list[Feature]:
         return []
     f, power, count = s.f[usable], s.power[usable], s.count[usable]
     base = np.exp(median_filter(np.log(np.maximum(power, 1e-300)), size=_OCTAVE, mode="nearest"))
-    excess, sigma = power / base - 1, np.sqrt(2 / count)
-    core = (excess > _LINE_SIGMAS * sigma) & (excess > _LINE_RATIO - 1)
-    reach = (excess > _LINE_EDGE * sigma) & (excess > (_LINE_RATIO - 1) / 3)
+    excess, sigma = np.log(np.maximum(power, 1e-300) / base), np.sqrt(2 / count)  # of a logarithm: chance has no long tail upwards
+    core = excess > np.maximum(_LINE_SIGMAS * sigma, _LINE_EXCESS)
+    reach = excess > np.maximum(_LINE_EDGE * sigma, _LINE_EXCESS / 3)
     starts = np.flatnonzero(reach & ~np.concatenate([[False], reach[:-1]]))
     ends = np.flatnonzero(reach & ~np.concatenate([reach[1:], [False]])) + 1
     lines = []
@@ -163,7 +163,7 @@ def goodness(found: Sequence[Misfit]) -> float:
 def discrepancy(found: Sequence[Misfit]) -> float:
     """Return by how much, relative, the model's power is off from half octave to half octave, beyond chance: 0 where it fits."""
     used = [m for m in found if m.used]
-    if goodness(used) > _ENOUGH_DOF:
+    if goodness(used) > _FITS:
         return 0.0
 
     def excess(delta: float) -> float:

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 TERMS = ("white", "flicker", "walk", "quantisation")  # of the linear model: PSD = sum of coefficient^2 x shape(f)
 LOW, _LEAST_LOW = 40, 8  # modes taken with their full covariance: of one piece, and of each of many
+_RAMP_REACH = 30000  # the highest mode from which a ramp is taken out
 _BAND = 0.02  # relative width of a band: the spectrum's slope within it cannot be seen
 
 
@@ -58,11 +59,12 @@ def spectrum(pieces: Sequence[Array], rate_hz: float) -> Spectrum:
 def _band_sums(mode: Array, low: int, rate_hz: float) -> Array:
     """Return frequency, number of modes and summed squares (3, b) of the bands beyond the low modes."""
     n = len(mode) + 1
-    k = np.arange(low + 1, n)
+    k = np.arange(low + 1, min(n, _RAMP_REACH))
     # A ramp's amplitudes, cos / sin^2 of pi k / 2 n for odd k, are nothing here unless it is huge; what mode 1 can be of it is taken out.
     half = np.pi / (2 * n)
     ramp = np.where(k % 2 == 1, np.cos(half * k) / np.sin(half * k) ** 2, 0.0) * np.tan(half) * np.sin(half)
-    squares = (mode[low:] - mode[0] * ramp) ** 2
+    squares = mode[low:] ** 2
+    squares[: len(k)] = (mode[low : low + len(k)] - mode[0] * ramp) ** 2
     edges = np.unique(np.round(np.geomspace(low + 1, n, max(2, int(np.log(n / (low + 1)) / _BAND)))).astype(np.int64))
     f = (edges[:-1] + edges[1:] - 1) / 2 * rate_hz / (2 * n)
     return np.stack([f, np.diff(edges).astype(np.float64), np.add.reduceat(squares, edges[:-1] - low - 1)])

@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 
 CONFIDENCE = 0.95
 _FINEST = 16  # the decimated mode's stride is at most tau / 16
-_ERROR = 1.5e-4  # the decimated mode's relative error where white noise dominates, one sigma
+_ERROR = 2e-4  # the decimated mode's relative error where white noise dominates, one sigma
 _KEPT = 1 << 14  # terms that are kept: a short recording is not thinned, it is cheap as it is
 _ABSURD = 1e100  # a power of the rates that no sensor has, and whose cumulative sums overflow
 

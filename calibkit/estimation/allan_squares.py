@@ -59,14 +59,16 @@ def thinned_mean_squares(p: Array, lags: Ints, strides: Ints, order: int) -> Arr
     mean[full] = squares(p, lags[full], order) / (len(p) - order * lags[full])
     active = np.zeros(len(lags), bool)
     s = int(strides.max(initial=1))
+    every = {1: p}  # period: p at its multiples, each halved from the one before, since strided copies of the whole cost as much as sums
+    while s > 1 and max(every) <= s:
+        every[2 * max(every)] = every[max(every)][::2].copy()
     while s > 1 or active.any():
         t = 2 * s
         fresh = np.flatnonzero((strides == s) & (s > 1))
-        even[fresh] = squares(p[::t].copy(), lags[fresh] // t, order)
+        even[fresh] = squares(every[t], lags[fresh] // t, order)
         active[fresh] = True
         now = np.flatnonzero(active)
-        other = p[s::t].copy()
-        odd = squares(other, lags[now] // t, order)
+        odd = squares(every[s][1::2].copy(), lags[now] // t, order)
         n_even, n_odd = (-(-(len(p) - offset) // t) - order * lags[now] // t for offset in (0, s))
         halves = even[now] / n_even, odd / np.maximum(n_odd, 1)
         even[now] += odd

@@ -9,7 +9,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import log, pi, sqrt
+from math import log, pi, radians, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,3 +80,28 @@ class ImuModel:
         """Return the values by name of PARAMETERS."""
         parts = (self.M_a[_ROWS, _COLUMNS], self.b_a, self.M_g[_ROWS, _COLUMNS], so3.log(self.C_g_i), self.b_g, self.A_g.ravel())
         return dict(zip(PARAMETERS, np.concatenate(parts).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """|g| in m/s^2 with what is not known of it: an accelerometer's scale hangs on it."""
+
+    value: float
+    sigma: float
+    source: str
+
+
+STANDARD_GRAVITY = Gravity(9.80665, 0.015, "the standard's; on Earth it is 9.78 to 9.83: give --gravity or --latitude")
+
+
+def gravity_at(latitude_deg: float, altitude_m: float | None = None) -> Gravity:
+    """Return normal gravity on the WGS 84 ellipsoid (Somigliana) less 3.086e-6 m/s^2 a metre of altitude.
+
+    g = 9.7803253359 (1 + 0.00193185265241 sin^2 B) / sqrt(1 - 0.00669437999013 sin^2 B) (NIMA TR8350.2, eq. 4-1). Real gravity differs by
+    some 2e-4 m/s^2; an altitude that is not given, by half a kilometre.
+    """
+    s2 = sin(radians(latitude_deg)) ** 2
+    normal = 9.7803253359 * (1 + 0.00193185265241 * s2) / sqrt(1 - 0.00669437999013 * s2)
+    sigma = 3e-4 if altitude_m is not None else 1.6e-3
+    where = f"latitude {latitude_deg:g} deg" + ("" if altitude_m is None else f", {altitude_m:g} m up")
+    return Gravity(normal - 3.086e-6 * (altitude_m or 0.0), sigma, where)

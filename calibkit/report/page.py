@@ -11,7 +11,7 @@ from calibkit.data.rig import CONVENTIONS
 from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import draw
-from calibkit.report.parameters import SIGMA_NOTE
+from calibkit.report.parameters import sigma_note
 from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines
 from calibkit.version import __version__
 
@@ -42,7 +42,7 @@ def build(summary: Summary) -> dict[str, bytes]:
         thumbnails=thumbnails,
         conventions=CONVENTIONS,
         about=_about(summary),
-        sigma_note=SIGMA_NOTE,
+        sigma_note=sigma_note(summary.rig),
         version=__version__,
     )
     data = json.dumps(as_json(summary, pictures), indent=1, ensure_ascii=False, allow_nan=False) + "\n"

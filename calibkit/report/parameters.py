@@ -6,16 +6,19 @@ from math import degrees, floor, log10
 
 import numpy as np
 
-from calibkit.data.rig import Camera, Estimate, Imu, Noise, Rig, TimeOffset, Transform
+from calibkit.data.rig import Camera, Estimate, Imu, ImuIntrinsics, Noise, Rig, TimeOffset, Transform
 from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
 from calibkit.report.imu_units import for_people
 
-SIGMA_NOTE = (
-    "sigma is one standard deviation, plain takes corners as independent; factor is their ratio: it covers errors that neighbouring "
-    "frames share and what the detector always errs by at one place of the image."
-)
+_SIGMA_NOTE = "sigma is one standard deviation, plain takes residuals as independent; factor is their ratio: it covers what residuals share"
+_CAMERA_NOTE = "neighbouring frames have errors in common, and the detector always errs alike at one place of the image"
+
+
+def sigma_note(rig: Rig) -> str:
+    """Return what the columns sigma, plain and factor mean."""
+    return f"{_SIGMA_NOTE}{f' ({_CAMERA_NOTE})' if rig.cameras else ''}."
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,10 @@ def number(value: float) -> str:
     return f"{value:.{_decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}" if value else "0"
 
 
-def parts(rig: Rig) -> dict[str, Camera | Transform | TimeOffset]:
-    """Return what of the rig carries a verdict, by name."""
-    return {**rig.cameras, **rig.transforms, **rig.time_offsets}
+def parts(rig: Rig) -> list[tuple[str, Camera | Transform | TimeOffset | Imu | ImuIntrinsics]]:
+    """Return what of the rig carries a verdict, with its name; an IMU's noise and its intrinsics have one each."""
+    intrinsics = {name: imu.intrinsics for name, imu in rig.imus.items() if imu.intrinsics is not None}
+    return [pair for entries in (rig.cameras, rig.transforms, rig.time_offsets, rig.imus, intrinsics) for pair in entries.items()]
 
 
 def rows(rig: Rig) -> list[Row]:
@@ -128,7 +132,7 @@ def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
     """Return what the rig file says against its own parts beyond the `known` reasons: stored verdicts, and parameters not observable."""
     heard = {reason.text for reason in known}
     out = []
-    for part, entry in parts(rig).items():
+    for part, entry in parts(rig):
         if entry.verdict is None:
             continue
         texts = [text for text in entry.reasons if text not in heard]

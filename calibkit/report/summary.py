@@ -10,7 +10,7 @@ from calibkit.data.result import Result
 from calibkit.data.rig import Rig
 from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import one_line
-from calibkit.report.parameters import SIGMA_NOTE, Row, parts, rig_reasons, rows
+from calibkit.report.parameters import Row, parts, rig_reasons, rows, sigma_note
 from calibkit.report.signals import Signal, measure, not_good
 from calibkit.report.view import View, views
 
@@ -44,7 +44,7 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
     said += tuple(Reason(Verdict.FAIL, f"not observable in this recording: {name}") for name in unsaid)
     said += not_good(signals)
     if not said:
-        judged = any(part.verdict for part in parts(rig).values())
+        judged = any(entry.verdict for _, entry in parts(rig))
         text = "nothing speaks against it" if judged else "no stage of calibkit has judged this rig: its numbers were given, not estimated"
         said = (Reason(Verdict.PASS if judged else Verdict.CHECK, text),)
     order = list(Verdict)
@@ -63,7 +63,7 @@ def text(summary: Summary) -> str:
     lines = [*told, ""] if told else []
     lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
     if any(row.factor for row in summary.parameters):
-        lines.append(f"{SIGMA_NOTE}\n")
+        lines.append(f"{sigma_note(summary.rig)}\n")
     if summary.signals:
         head = [("sensor", "signal", "measured", "good", "", "seen")]
         lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))
@@ -75,7 +75,12 @@ def text(summary: Summary) -> str:
 def stage_lines(summary: Summary) -> list[str]:
     """Return what the stages say of their recordings in lines of their own."""
     found = [result.facts.get("lines") for result in summary.results]
-    return [one_line(line, 1000) for lines in found if isinstance(lines, list) for line in lines]
+    return [
+        ("  " if line[:1] == " " else "") + one_line(line, 1000).strip()
+        for lines in found
+        if isinstance(lines, list)
+        for line in map(str, lines)
+    ]
 
 
 def camera_lines(summary: Summary) -> list[str]:

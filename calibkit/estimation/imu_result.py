@@ -1,0 +1,101 @@
+"""From an IMU's calibration to a result: what the rig file keeps of it, and the stands that its report draws."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.observations import ImuUnit
+from calibkit.data.plural import counted
+from calibkit.data.result import ResidualSet, Result
+from calibkit.data.rig import Covariance, Estimate, Imu, ImuIntrinsics, Rig
+from calibkit.data.verdict import Status
+from calibkit.estimation.imu_intrinsics import ImuCalibration
+from calibkit.models.imu import CORRECTION, EQUATION, Gravity
+
+Array = NDArray[np.float64]
+
+_UNITS: dict[ImuUnit, dict[str, str]] = {
+    "SI": {"M_a": "", "b_a": "m/s^2", "M_g": "", "phi": "rad", "b_g": "rad/s", "A_g": "rad/s/(m/s^2)"},
+    "counts": {
+        "M_a": "counts/(m/s^2)",
+        "b_a": "counts",
+        "M_g": "counts/(rad/s)",
+        "phi": "rad",
+        "b_g": "counts",
+        "A_g": "counts/(m/s^2)",
+    },
+}
+
+
+def imu_result(
+    name: str, topic: str, found: ImuCalibration, unit: ImuUnit, gravity: Gravity, rate_hz: float, start_ns: int, before: Imu
+) -> Result:
+    """Return the result of stage `imu`; `before` is what a rig file already says of this IMU."""
+    cov = _with_gravity(found, gravity)
+    sigma = dict(zip(found.names, np.sqrt(np.diag(cov)).tolist(), strict=True))
+    parameters = {
+        key: Estimate(
+            value=number.value, unit=_UNITS[unit][key[:3]], sigma=sigma.get(key), sigma_plain=number.sigma_plain, status=number.status
+        )
+        for key, number in found.parameters.items()
+    }
+    intrinsics = ImuIntrinsics(
+        equation=EQUATION,
+        correction=CORRECTION,
+        unit=unit,
+        gravity=gravity.value,
+        parameters=parameters,
+        covariance=Covariance(order=list(found.names), matrix=cov.tolist()) if found.names else None,
+        verdict=found.verdict,
+        reasons=[reason.text.removeprefix(f"{name}: ") for reason in found.reasons],
+    )
+    imu = before.model_copy(update={"topic": topic, "rate_hz": rate_hz, "intrinsics": intrinsics})
+    return Result(
+        stage="imu",
+        rig=Rig(imus={name: imu}),
+        reasons=found.reasons,
+        residuals=(_residuals(name, found, start_ns),),
+        facts={
+            "lines": _lines(name, topic, found, rate_hz, gravity),
+            "imu": name,
+            "advice": list(found.advice),
+            "threshold": found.multiplier,
+        },
+        not_observable=tuple(f"{name}.{key}" for key, number in found.parameters.items() if number.status is Status.NOT_OBSERVABLE),
+    )
+
+
+def _with_gravity(found: ImuCalibration, gravity: Gravity) -> Array:
+    """Return the covariance with what is not known of gravity: M_a goes as 1 / g, all of it together."""
+    slope = np.array([(found.parameters[key].value or 0.0) / gravity.value if key.startswith("M_a") else 0.0 for key in found.names])
+    out: Array = found.cov + gravity.sigma**2 * np.outer(slope, slope)
+    return out
+
+
+def _residuals(name: str, found: ImuCalibration, start_ns: int) -> ResidualSet:
+    stands = found.stands
+    middle = np.array([(stand.start_s + stand.end_s) / 2 for stand in stands])
+    return ResidualSet(
+        sensor=name,
+        unit="m/s²",
+        t_ns=start_ns + np.round(middle * 1e9).astype(np.int64),
+        raw=np.array([[stand.misfit] for stand in stands]),
+        sigma=np.full(len(stands), max(found.misfit_rms, 1e-12)),
+        context={
+            "kept": np.array([stand.dropped is None for stand in stands]),
+            "attitude": np.array([stand.up for stand in stands], float),
+        },
+    )
+
+
+def _lines(name: str, topic: str, found: ImuCalibration, rate_hz: float, gravity: Gravity) -> list[str]:
+    used = sum(stand.dropped is None for stand in found.stands)
+    lines = [
+        f"{name}: {topic}, {rate_hz:.4g} Hz; {counted(len(found.stands), 'stand')} found, {used} used; "
+        f"|a| - g {found.misfit_rms:.2g} m/s^2 rms, gravity's direction after a turn {np.degrees(found.turn_rms):.2g} deg rms",
+        f"  gravity {gravity.value:.5f} +- {gravity.sigma:.2g} m/s^2 ({gravity.source})",
+        f"  model: {EQUATION}",
+        f"  correction: {CORRECTION}",
+    ]
+    lines += [f"  left out: stand at {stand.start_s:.1f} s, {stand.dropped}" for stand in found.stands if stand.dropped]
+    lines += [f"  left out: turn at {begin:.1f} to {end:.1f} s, it contradicts the others" for begin, end in found.dropped_turns]
+    return lines

@@ -181,6 +181,11 @@ def test_pose_csv_and_tum(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(np.hstack([poses.p, poses.q]), [[1, 2, 3, 0, 0, 0.6, 0.8]], atol=1e-15)
 
 
+def test_an_odometry_with_rates_is_poses(tmp_path: Path) -> None:
+    text = "t,x,y,z,qx,qy,qz,qw,wx,wy,wz\n1,1,2,3,0,0,0,1,7,8,9\n"
+    assert [topic.kind for topic in open_recording([_csv(tmp_path, text)]).topics] == ["pose"]
+
+
 def test_rows_that_are_cut_or_mean_nothing_are_left_out_and_told(tmp_path: Path) -> None:
     text = "t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\n2,nan,2,3,4,5,6\n3,1,2,3,4,5,6\n4,1,2,3"
     recording = open_recording([_csv(tmp_path, text)])

@@ -13,7 +13,7 @@ from calibkit.io.imu_options import ImuOptions
 from calibkit.io.imu_text import find_imu, imu_source
 from calibkit.io.ros_bag import unit_poses
 from calibkit.io.source import CornerRows, Look, Source, Stamps, TopicInfo
-from calibkit.io.text_table import WANTED, XYZ, Q, TextTable, stem
+from calibkit.io.text_table import ACCEL, GYRO, WANTED, XYZ, Q, TextTable, stem
 
 _CORNER = ("tag_id", "corner_idx", "u", "v")
 
@@ -25,11 +25,11 @@ def csv_source(path: Path, topic: str, options: ImuOptions) -> Source:
     table = TextTable(path, source.name, source.warn)
     if table.holds("t", *_CORNER):  # corner files have x, y, z as well, so they are looked for first
         return _corner_source(table, topic, source)
+    if table.holds("t", *XYZ, *Q) and not table.holds(*GYRO, *ACCEL):  # with rates beside the poses, it is an odometry and no gyroscope
+        return _pose_source(table, topic, source)
     if held := find_imu(table, options):
         imu_source(table, topic, source, held, options)
         return source
-    if table.holds("t", *XYZ, *Q):
-        return _pose_source(table, topic, source)
     raise BadInputError(f"{source.name} is not recognised: {WANTED}")
 
 

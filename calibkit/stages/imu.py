@@ -8,6 +8,7 @@ import numpy as np
 
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Imu
+from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.imu_intrinsics import calibrate_imu
 from calibkit.estimation.imu_result import imu_result
 from calibkit.estimation.imu_times import in_order, rate_hz
@@ -41,7 +42,10 @@ def imu(sources: Sequence[Path], outputs: Outputs | None = None, options: Option
     samples = in_order(source.samples)
     start_ns = int(samples.t_ns[0])
     t = np.asarray((samples.t_ns - start_ns) * 1e-9, np.float64)
-    found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, source.name)
+    try:
+        found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, source.name)
+    except BadInputError as error:
+        raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {str(error).removeprefix(f'{source.name}: ')}") from None
     before = base.imus.get(source.name, Imu())
     result = imu_result(source.name, source.topic, found, samples.unit, options.gravity, rate_hz(samples.t_ns), start_ns, before)
     result = replace(result, facts={**result.facts, "warnings": source.recording.warnings})

@@ -1,0 +1,164 @@
+"""`calibkit imu` from the command line: stands in, scale and axes out, and one line for every mistake."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibkit.cli.main import main
+from calibkit.data.rig import ImuIntrinsics
+from calibkit.data.verdict import Status, Verdict
+from calibkit.geometry import so3
+from calibkit.io.rig_file import load_rig
+from calibkit.models.imu import STANDARD_GRAVITY, ImuModel, gravity_at
+from calibkit.simulation.multi_position import MultiPosition, MultiPositionPlan, simulate_multi_position
+
+Array = NDArray[np.float64]
+
+G = 9.81
+ODD = ImuModel(
+    M_a=np.array([[1.01, 0, 0], [0.004, 0.99, 0], [-0.003, 0.006, 1.005]]),
+    b_a=np.array([0.1, -0.08, 0.12]),
+    M_g=np.array([[0.995, 0, 0], [0.003, 1.008, 0], [-0.004, 0.002, 1.002]]),
+    C_g_i=so3.exp(np.array([0.004, -0.006, 0.008])),
+    b_g=np.array([0.01, -0.02, 0.015]),
+)
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a run ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def mistake(self) -> str:
+        """The one line of an error that wrote nothing."""
+        lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
+        assert (self.code, self.out, len(lines)) == (2, "", 1), self
+        return lines[0].removeprefix("calibkit: ")
+
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    def calibkit(*arguments: object) -> Said:
+        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        return Said(int(end.value.code or 0), said.out, said.err)
+
+    return calibkit
+
+
+def write(path: Path, made: MultiPosition, most: int | None = None) -> Path:
+    rows = np.column_stack([made.t, made.gyro, made.accel])[:most]
+    np.savetxt(path, rows, "%.9f", ",", header="t [s],wx,wy,wz,ax,ay,az", comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def made() -> MultiPosition:
+    return simulate_multi_position(MultiPositionPlan(model=ODD, gravity=G, rate_hz=50.0), seed=3)
+
+
+@pytest.fixture(scope="module")
+def recording(made: MultiPosition, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("stands") / "imu.csv", made)
+
+
+def intrinsics(path: Path) -> ImuIntrinsics:
+    found = load_rig(path).imus["imu0"].intrinsics
+    assert found is not None
+    return found
+
+
+def test_stands_in_scale_and_axes_out(run: Run, recording: Path, made: MultiPosition, tmp_path: Path) -> None:
+    said = run("imu", recording, "--gravity", G, "-o", tmp_path / "rig.yaml", "--report", tmp_path / "report")
+    assert said.code == 0, said
+    found = intrinsics(tmp_path / "rig.yaml")
+    truth = made.model.values()
+    for name, estimate in found.parameters.items():
+        assert estimate.status is Status.DETERMINED
+        assert estimate.value is not None
+        assert estimate.sigma is not None
+        assert abs(estimate.value - truth[name]) < 4.5 * estimate.sigma, name
+    assert found.verdict is Verdict.PASS
+    assert found.correction in said.out
+    assert {path.name for path in (tmp_path / "report").iterdir()} == {"imu0-imu-stands.png", "report.html", "report.json"}
+    values = {name: estimate.value for name, estimate in found.parameters.items() if estimate.value is not None}
+    force, omega = np.array([[0.3, -9.0, 4.0]]), np.array([[0.5, -0.2, 0.9]])
+    a, w = ImuModel.of(values).correct(*made.model.measure(force, omega))
+    np.testing.assert_allclose(a, force, atol=0.01)
+    np.testing.assert_allclose(w, omega, atol=0.005)
+    assert run("report", tmp_path / "rig.yaml").code == 0
+
+
+def test_raw_counts_in_two_files(run: Run, tmp_path: Path) -> None:
+    device = ImuModel(
+        M_a=415 * ODD.M_a, b_a=np.array([33123.0, 33276, 32360]), M_g=4778 * ODD.M_g, C_g_i=ODD.C_g_i, b_g=np.array([32768.0, 32466, 32485])
+    )
+    made = simulate_multi_position(MultiPositionPlan(model=device, gravity=G, rate_hz=50.0, counts=True), seed=1)
+    for name, values in (("acc.txt", made.accel), ("gyro.txt", made.gyro)):
+        np.savetxt(tmp_path / name, np.column_stack([made.t, values]), "%.6f")
+    units = ("--gyro-unit", "counts", "--accel-unit", "counts")
+    said = run("imu", tmp_path / "acc.txt", tmp_path / "gyro.txt", *units, "--gravity", G, "-o", tmp_path / "rig.yaml")
+    assert said.code == 0, said
+    found = intrinsics(tmp_path / "rig.yaml")
+    assert found.unit == "counts"
+    assert found.parameters["M_a_xx"].unit == "counts/(m/s^2)"
+    truth = made.model.values()
+    for name in ("M_a_xx", "M_a_zy", "b_a_z", "M_g_zz", "b_g_x"):
+        estimate = found.parameters[name]
+        assert estimate.value == pytest.approx(truth[name], abs=4.5 * (estimate.sigma or 0)), name
+    assert "raw counts" in run("allan", tmp_path / "acc.txt", tmp_path / "gyro.txt", *units).mistake
+
+
+def test_gravity_that_is_not_given_is_in_the_scales_sigma(run: Run, recording: Path, tmp_path: Path) -> None:
+    sigmas = {}
+    for name, options in (("given", ("--gravity", G)), ("place", ("--latitude", 47.4, "--altitude", 400)), ("none", ())):
+        run("imu", recording, *options, "-o", tmp_path / f"{name}.yaml")
+        sigmas[name] = intrinsics(tmp_path / f"{name}.yaml").parameters["M_a_xx"].sigma
+    assert sigmas["given"] < sigmas["place"] < sigmas["none"]
+    assert sigmas["none"] == pytest.approx(1.01 * STANDARD_GRAVITY.sigma / STANDARD_GRAVITY.value, rel=0.1)
+    # Zurich's gravity is 9.8067 (Swiss gravity net 9.80648); the equator's and the pole's normal gravity are WGS 84's own
+    assert gravity_at(47.4, 400).value == pytest.approx(9.8067, abs=1e-3)
+    assert gravity_at(0, 0).value == pytest.approx(9.7803253359, abs=1e-9)
+    assert gravity_at(-90, 0).value == pytest.approx(9.8321849378, abs=1e-9)
+    assert "give one of them" in run("imu", recording, "--gravity", G, "--latitude", 47).mistake
+    assert "--altitude needs --latitude" in run("imu", recording, "--altitude", 400).mistake
+    assert "is no gravity" in run("imu", recording, "--gravity", "nan").mistake
+
+
+def test_too_few_attitudes_are_said_and_what_to_add(run: Run, tmp_path: Path) -> None:
+    flat = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([0, 90, 180, 270, 45, 135, 225, 315])])
+    made = simulate_multi_position(MultiPositionPlan(model=ODD, up=np.repeat(flat, 2, axis=0), gravity=G, rate_hz=50.0), seed=0)
+    said = run("imu", write(tmp_path / "flat.csv", made), "--gravity", G, "-o", tmp_path / "rig.yaml")
+    assert said.code == 3, said
+    found = intrinsics(tmp_path / "rig.yaml")
+    assert found.parameters["M_a_zz"].value is None
+    assert found.parameters["M_a_xx"].value is not None
+    assert "z scale of the accelerometer (M_a_zz)" in said.out or "M_a_zz" in said.out
+    assert "not observable" in said.out
+    assert "more position" in said.out
+
+
+def test_mistakes_are_one_line(run: Run, made: MultiPosition, recording: Path, tmp_path: Path) -> None:
+    assert "stand" in run("imu", write(tmp_path / "short.csv", made, 20 * 50)).mistake
+    moving = np.column_stack([made.t, np.sin(made.t[:, None] * [2.0, 3.1, 0.7]), 9.8 * np.cos(made.t[:, None] * [1.3, 2.2, 0.9])])
+    np.savetxt(tmp_path / "moving.csv", moving, "%.9f", ",", header="t [s],wx,wy,wz,ax,ay,az", comments="")
+    assert "moving.csv: moving: the IMU never stood still" in run("imu", tmp_path / "moving.csv").mistake
+    np.savetxt(tmp_path / "gyro.csv", moving[:, :4], "%.9f", ",", header="t [s],wx,wy,wz", comments="")
+    assert "has no accelerometer" in run("imu", tmp_path / "gyro.csv").mistake
+    assert "--gyro-unit furlongs" in run("imu", recording, "--gyro-unit", "furlongs").mistake
+    assert "which imu topic" in run("imu", recording, tmp_path / "short.csv").mistake
+    assert not list(tmp_path.glob("*.npz"))

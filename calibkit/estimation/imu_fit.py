@@ -20,6 +20,7 @@ Mask = NDArray[np.bool_]
 _ROBUST = 3.0  # sigmas, Cauchy
 _OUTLIER = 5.0  # sigmas
 _ROUNDS = 4
+_RESTLESS = 25.0  # times the median stand's variance
 _ROUGHLY, _EXACTLY = 1e-4, 1e-7  # of the cost: what another step must promise
 _FIRST = replace(USUAL, misfit=1e-3, wobble=1e-3, turn=5e-3)
 _GAP = 5.0  # median intervals: a turn is not integrated across
@@ -68,7 +69,8 @@ def fit_imu(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
 
 def _fit(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
     guess = _guess(samples, stands)
-    used, why = np.ones(len(stands), bool), dict[int, str]()
+    why = _restless(stands)
+    used = ~np.isin(np.arange(len(stands)), list(why))
     bad_turns: set[tuple[int, int]] = set()
     problem = _problem(samples, stands, guess, used, bad_turns, sensitivity)
     x = _first_fit(problem)
@@ -136,6 +138,12 @@ def _problem(
         size=30 if sensitivity else 21,
         prior=_PRIOR[: 30 if sensitivity else 21],
     )
+
+
+def _restless(stands: Stands) -> dict[int, str]:
+    """Return the stands whose own samples scatter far more than the others' do."""
+    density = np.trace(stands.cov_accel, axis1=1, axis2=2) * (stands.end_s - stands.start_s)
+    return {int(i): "it was moved while it stood" for i in np.flatnonzero(density > _RESTLESS * np.median(density))}
 
 
 def _first_fit(problem: StandProblem) -> State:

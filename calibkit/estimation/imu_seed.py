@@ -66,7 +66,7 @@ def seed_accel(accel: Array, gravity: float) -> AccelSeed:
     return AccelSeed(M * sign, middle + spread * centre + scale * inverse @ values[6:], np.linalg.norm(v, axis=1) - 1, J.T @ J)
 
 
-def seed_gyro(t: Array, gyro: Array, up: Array, use: NDArray[np.bool_]) -> Array:
+def seed_gyro(t: Array, gyro: Array, up: Array, moving: NDArray[np.bool_]) -> Array:
     """Return K (3, 3) of omega = K gyro (bias removed) from how the accelerometer's direction `up` (n, 3) turns: d up / dt = up x omega.
 
     Linear in K over pieces of about a fifth of a second, the hand's own accelerations taken for chance.
@@ -81,10 +81,10 @@ def seed_gyro(t: Array, gyro: Array, up: Array, use: NDArray[np.bool_]) -> Array
     middle = at[:-1] + size // 2
     turned = angle[middle[1:]] - angle[middle[:-1]]
     ends, starts = smooth[1:], smooth[:-1]
-    moving = ~np.logical_and.reduceat(~use, at[:-1])[:-1]
-    mean = 0.5 * (ends + starts)[moving]
-    J = np.einsum("nij,nk->nijk", hat(mean), turned[moving]).reshape(-1, 9)
-    right = (ends - starts)[moving].ravel()
+    turning = np.logical_or.reduceat(moving, at[:-1])[:-1]
+    mean = 0.5 * (ends + starts)[turning]
+    J = np.einsum("nij,nk->nijk", hat(mean), turned[turning]).reshape(-1, 9)
+    right = (ends - starts)[turning].ravel()
     weight = np.ones(len(right))
     size_of_turn = float(np.sqrt(np.mean(turned**2))) or 1.0
     K = np.zeros(9)

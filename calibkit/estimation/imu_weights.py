@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 # m/s^2, rad/s, rad/sqrt(rad), m/s^2/sqrt(s), rad/s/sqrt(s): below the first nothing is lost, above the second nothing is an IMU.
 _LEAST = np.array([1e-5, 1e-7, 1e-5, 1e-6, 1e-8])
 # What a sound device shows, worth one observation each: with few stands, residuals of nothing are no proof of no errors.
-USUAL = Weights(misfit=3e-4, wobble=3e-5, turn=1e-3, walk_accel=1e-5, walk_gyro=1e-7)
+USUAL = Weights(misfit=3e-4, wobble=3e-5, turn=3e-4, walk_accel=1e-5, walk_gyro=1e-7)
 _MOST = np.array([1.0, 0.1, 0.3, 0.1, 0.01])
 
 
@@ -45,7 +45,7 @@ def find_weights(problem: StandProblem, x: State) -> Weights:
     usual_log = 2 * np.log(list(vars(USUAL).values()))
     start = 2 * np.log(np.clip(np.array(list(vars(problem.weights).values())), 2 * _LEAST, _MOST / 2))
     bounds = list(zip(2 * np.log(_LEAST), 2 * np.log(_MOST), strict=True))
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25, "ftol": 1e-6})
+    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25, "ftol": 1e-5})
     return Weights(*np.exp(0.5 * found.x).tolist())
 
 

@@ -15,8 +15,10 @@ _WINDOW_S = 0.5  # variance is taken over this; a stand loses half of it at each
 _SHORTEST_S = 0.75  # of a stand, after that
 _MULTIPLIERS = np.geomspace(2.0, 100.0, 12)  # of the still variance, scanned (Tedaldi 2014, III-C)
 _USUAL_MULTIPLIER = 10.0  # where too few stands can tell one from another
+_AS_GOOD = 2.0  # of the log determinant of nine numbers: a tenth of their sigmas
 _QUIET = 0.1  # quantile of the windows' variances that is taken for stillness
-_BLOCK_S = 0.25  # means over this are taken for independent
+_BLOCK_S, _LONG_BLOCK_S = 0.25, 1.0  # means over the first are many, over the second independent
+_TRUSTED_MEDIAN = 6  # blocks a stand
 _POOLED_BLOCKS = 16  # weight of what all stands say of the noise, beside a stand's own blocks
 _TURNS_STILL = 0.05  # rms of the stands' mean rates over that of the recording, above which it never stood still
 _GAP = 5.0  # median intervals
@@ -57,12 +59,14 @@ def find_stands(t: Array, gyro: Array, accel: Array, gravity: float) -> Stands:
 
     Still is where the variance of every sensor over half a second is below m times the quiet variance. Of m = 2 ... 100 the one is
     taken that determines the accelerometer best: the largest det(J^T J / s^2), s^2 the variance of |a| at rest, which stands too few,
-    too short and with motion in them all lower. Raises BadInputError where there are no stands.
+    too short and with motion in them all lower; of those as good, the smallest. Raises BadInputError where there are no stands.
     """
     ratio = _variance_ratio(t, gyro, accel)
     choices = [intervals(t, ratio, float(m)) for m in _MULTIPLIERS]
     scores = [_score(accel, gravity, *choice) for choice in choices]
-    best = int(np.argmax(scores)) if np.isfinite(scores).any() else int(np.argmin(np.abs(np.log(_MULTIPLIERS / _USUAL_MULTIPLIER))))
+    best = int(np.argmin(np.abs(np.log(_MULTIPLIERS / _USUAL_MULTIPLIER))))
+    if np.isfinite(scores).any():
+        best = int(np.argmax(scores >= np.max(scores) - _AS_GOOD))
     first, last = choices[best]
     if len(first) == 0:
         raise BadInputError(f"the IMU never stood still for {_SHORTEST_S + _WINDOW_S:.1f} s: put it down, still, in 12 or more attitudes")
@@ -144,26 +148,37 @@ def _stands(t: Array, gyro: Array, accel: Array, first: Index, last: Index, mult
 def _covariance_of_means(t: Array, x: Array, first: Index, last: Index, mean: Array, length: Array) -> tuple[Array, Array]:
     """Return the covariance (n, 3, 3) of the stands' means and the noise density squared (3, 3).
 
-    Batch means: blocks of a quarter of a second are independent where neighbouring samples are not; a stand's own few blocks are
-    shrunk towards those of all. Coarse steps that noise does not dither add their own error (Widrow 1996).
+    Batch means: blocks of a quarter of a second, a stand's own few shrunk towards those of all, times what blocks of a second say more
+    where neighbours are alike for longer. Coarse steps that noise does not dither add their own error (Widrow 1996).
     """
-    per_block = max(round(_BLOCK_S / float(np.median(np.diff(t)))), 2)
+    outer, freedom, pooled = _blocks(t, x, first, last, mean, _BLOCK_S)
+    longer = float(np.trace(_blocks(t, x, first, last, mean, _LONG_BLOCK_S)[2])) / max(float(np.trace(pooled)), 1e-300)
+    own = (outer + _POOLED_BLOCKS * pooled) / (freedom + _POOLED_BLOCKS)[:, None, None] * max(longer, 1.0)
+    step = _quantum(x)
+    variance = np.maximum(np.diag(pooled) / float(np.median(np.diff(t))), 1e-300)
+    dither = 0.5 * (step / np.pi) ** 2 * np.exp(-4 * np.pi**2 * variance / np.where(step > 0, step, 1.0) ** 2)
+    cov: Array = own / length[:, None, None] + np.diag(dither + step**2 * 1e-6 + 1e-300)
+    return cov, pooled * max(longer, 1.0)
+
+
+def _blocks(t: Array, x: Array, first: Index, last: Index, mean: Array, block_s: float) -> tuple[Array, Array, Array]:
+    """Return per stand the sum of its blocks' scatter as density squared (n, 3, 3), their freedom (n,), and the density of all (3, 3)."""
+    interval = float(np.median(np.diff(t)))
+    per_block = max(round(block_s / interval), 2)
     counts = np.maximum((last - first) // per_block, 1)
     stand = np.repeat(np.arange(len(first)), counts)
     number = np.arange(len(stand)) - np.repeat(np.cumsum(counts) - counts, counts)
     begin = first[stand] + number * per_block
-    d = _means(x, begin, np.minimum(begin + per_block, last[stand])) - mean[stand]
+    of_block = _means(x, begin, np.minimum(begin + per_block, last[stand]))
+    middle = np.zeros_like(mean)
+    np.add.at(middle, stand, of_block / counts[stand, None])
+    d = of_block - middle[stand]
     outer = np.zeros((len(first), 3, 3))
-    np.add.at(outer, stand, d[:, :, None] * d[:, None, :])
-    block_s = per_block * float(np.median(np.diff(t)))
-    pooled = np.median(outer / np.maximum(counts - 1, 1)[:, None, None], axis=0)
-    total = outer.sum(axis=0) / max(int(np.sum(counts - 1)), 1)
-    # The median stand's noise: one stand that moves does not raise everyone's; its own blocks raise its own.
-    pooled = total * min(1.0, float(np.trace(pooled)) / max(float(np.trace(total)), 1e-300))
-    own = (outer + _POOLED_BLOCKS * pooled) / (counts - 1 + _POOLED_BLOCKS)[:, None, None]
-    step = _quantum(x)
-    variance = np.maximum(np.diag(pooled) * per_block, 1e-300)
-    dither = 0.5 * (step / np.pi) ** 2 * np.exp(-4 * np.pi**2 * variance / np.where(step > 0, step, 1.0) ** 2)
-    floor = np.diag(dither + step**2 * 1e-6 + 1e-300)
-    cov: Array = own * (block_s / length)[:, None, None] + floor
-    return cov, pooled * block_s
+    np.add.at(outer, stand, d[:, :, None] * d[:, None, :] * per_block * interval)
+    freedom = counts - 1
+    total = outer.sum(axis=0) / max(int(freedom.sum()), 1)
+    # Not above the median stand's: one stand that moves does not raise everyone's; its own blocks raise its own.
+    some = freedom > 0
+    median = float(np.median(np.trace(outer[some], axis1=1, axis2=2) / freedom[some])) if some.any() else 0.0
+    few = 1.0 if np.median(freedom) >= _TRUSTED_MEDIAN else 1.5  # the median of a few squares is below their mean
+    return outer, freedom, total * min(1.0, few * median / max(float(np.trace(total)), 1e-300))

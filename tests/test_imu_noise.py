@@ -103,7 +103,6 @@ def test_a_short_recording_says_what_it_cannot_tell_and_a_long_one_tells() -> No
         assert short.hours_needed is not None
         assert short.resolves is not None
         assert short.hours_needed > 1 / 6
-        assert "longer than" in (short.advice or "")
         longer = fitted(SimNoise(TRUTH.white, TRUTH.flicker, short.resolves), short.hours_needed, 5.0, 100 + seed).walk
         assert longer.value is not None
 
@@ -134,7 +133,6 @@ def test_a_bump_is_named_and_not_swallowed_into_the_white_noise() -> None:
     assert fit.markov.time_s == pytest.approx(0.3, rel=0.15)
     assert fit.markov.sigma == pytest.approx(3e-4, rel=0.1)
     assert fit.white.value == pytest.approx(1.7e-4, rel=0.01)
-    assert any("bump" in reason and "0.5" in reason for reason in fit.reasons)
 
 
 def test_vibration_is_named_and_a_filter_is_left_out() -> None:
@@ -180,6 +178,14 @@ def test_a_stuck_axis_is_said_and_the_others_are_fitted() -> None:
     assert fits[1].white.status is Status.NOT_OBSERVABLE
     assert np.all(np.isfinite(fits[1].covariance))
     assert all(fits[i].white.value == pytest.approx(1.7e-4, rel=0.05) for i in (0, 2))
+
+
+def test_many_short_pieces_of_filtered_noise() -> None:
+    b, a = butter(2, 1 / 100)
+    x = lfilter(b, a, simulate_noise(TRUTH, 100_000, 200.0, np.random.default_rng(0)), axis=0)[2000:]
+    fit = fit_noise([x[i : i + 400] for i in range(0, len(x) - 400, 400)], 200.0)[0]
+    assert fit.f_max < 5
+    assert np.isfinite(fit.white.upper95)
 
 
 @pytest.mark.parametrize(
@@ -246,9 +252,8 @@ def test_the_hours_asked_for_do_resolve(hours: float) -> None:
                 runs.append(getattr(fitted(SimNoise(**known), term.hours_needed, 10.0, 1000 + seed), name).value is not None)
                 asked[name].append(term.hours_needed)
     for name, runs in outcome.items():
-        print(
-            f"\n{60 * hours:.0f} min: {name} not resolved in {len(runs)} of 40; median {np.median(asked[name]):.2f} h asked for, which resolve {np.mean(runs):.3f}"
-        )
+        print(f"\n{60 * hours:.0f} min: {name} not resolved in {len(runs)} of 40; median hours asked for {np.median(asked[name]):.2f}")
+        print(f"share of such recordings that resolve it: {np.mean(runs):.3f}")
         assert np.mean(runs) >= 0.85
 
 

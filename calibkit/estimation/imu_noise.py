@@ -5,17 +5,17 @@ correlation of the estimates comes with them. A term whose 95 % interval reaches
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
+from calibkit.estimation.noise_choice import Model, choose, damped, problem_of
 from calibkit.estimation.noise_hours import hours_to_resolve
 from calibkit.estimation.noise_interval import Interval, interval
-from calibkit.estimation.noise_likelihood import Fit, Problem, maximise, problem
+from calibkit.estimation.noise_likelihood import Fit, Problem, maximise
 from calibkit.estimation.noise_shape import (
     Feature,
     Misfit,
@@ -23,7 +23,6 @@ from calibkit.estimation.noise_shape import (
     find_cut,
     find_lines,
     goodness,
-    half_octaves,
     mask,
     misfits,
 )
@@ -33,11 +32,6 @@ Array = NDArray[np.float64]
 
 MIN_SAMPLES = 400
 _DETERMINED = 2.0  # upper over lower end of the 95 % interval up to which a term counts as determined
-_TERM_SHOWS = 10.83  # gain of the deviance that Q or R must bring: 99.9 % of chi-squared with 1 degree of freedom
-_MARKOV_SHOWS = 18.0  # and the Gauss-Markov term: 1.2e-4 of chi-squared with 2, its time being searched for
-_MARKOV_CORNER = 4.0  # its corner frequency lies at least this factor below f_max: what is faster is the sensor's filter
-_MARKOV_STEPS = 20
-_MARKOV_PEAK = 1.89  # tau over correlation time where a Gauss-Markov process shows most (IEEE Std 952, annex C)
 _AVAR = 2 * np.log(2) / np.pi
 
 
@@ -53,26 +47,13 @@ class NoiseTerm:
     hours_needed: float | None = None  # not observable: a recording longer than this resolves `resolves`; inf: none of 1000 h does
     resolves: float | None = None
 
-    @property
-    def advice(self) -> str | None:
-        """Return what to do about a term without a number."""
-        if self.hours_needed is None:
-            return None
-        longer = f"longer than {self.hours_needed:.2g} h" if np.isfinite(self.hours_needed) else "more than a recording of 1000 h"
-        return f"not resolved by this recording: {longer} needed"
-
 
 @dataclass(frozen=True)
 class Markov:
-    """A first-order Gauss-Markov process (exponentially correlated noise) beside the five terms."""
+    """A first-order Gauss-Markov process (exponentially correlated noise) beside the five terms: a bump near tau = 1.9 time_s."""
 
     sigma: float  # its standard deviation, x
     time_s: float  # correlation time
-
-    @property
-    def text(self) -> str:
-        seen = f"a bump in the Allan deviation near tau {_MARKOV_PEAK * self.time_s:.2g} s"
-        return f"exponentially correlated noise of {self.sigma:.2g} over {self.time_s:.2g} s, {seen}; N is that of shorter tau"
 
 
 @dataclass(frozen=True)
@@ -95,7 +76,7 @@ class AxisNoise:
     misfit: tuple[Misfit, ...]
     goodness: float  # probability that a right model fits no better
     discrepancy: float  # relative error of the model's power beyond chance, allowed for in the intervals
-    reasons: tuple[str, ...]  # what is to be known besides the numbers, in sentences
+    reasons: tuple[str, ...]  # why there is no number at all, in sentences
 
 
 def fit_noise(x: NDArray[np.floating] | Sequence[NDArray[np.floating]], rate_hz: float) -> list[AxisNoise]:
@@ -126,13 +107,6 @@ def model_deviation(noise: AxisNoise, tau: Array) -> Array:
     return deviation
 
 
-@dataclass(frozen=True)
-class _Model:
-    terms: tuple[int, ...] = (0, 1, 2)
-    markov_s: float | None = None
-    ramp: bool = False
-
-
 def _fit_axis(pieces: Sequence[NDArray[np.floating]], rate_hz: float) -> AxisNoise:
     columns = [np.asarray(p, dtype=np.float64) for p in pieces]
     if not all(np.all(np.isfinite(c)) for c in columns):
@@ -144,54 +118,17 @@ def _fit_axis(pieces: Sequence[NDArray[np.floating]], rate_hz: float) -> AxisNoi
     lines = find_lines(s)
     f_max, cut = find_cut(s, lines)
     weight = s.count * mask(s.f, lines, f_max)
-    model, p, fit = _choose(s, weight, f_max)
+    model, p, fit = choose(s, weight, f_max)
     delta = discrepancy(misfits(p, fit, s))
     if delta > 0:
-        p = _problem(s, _damped(s.f, weight, delta), model)
+        p = problem_of(s, damped(s.f, weight, delta), model)
         fit = maximise(p, fit.theta)
     return _axis(s, model, p, fit, unit, f_max, [*lines, *([cut] if cut else [])], delta)
 
 
-def _problem(s: Spectrum, weight: Array, model: _Model) -> Problem:
-    return problem(s, weight, model.terms, model.markov_s, model.ramp)
-
-
-def _choose(s: Spectrum, weight: Array, f_max: float) -> tuple[_Model, Problem, Fit]:
-    """Return the model: N, B, K, and whatever else the likelihood demands."""
-
-    def tried(model: _Model) -> tuple[_Model, Problem, Fit]:
-        p = _problem(s, weight, model)
-        return model, p, maximise(p)
-
-    def better(now: tuple[_Model, Problem, Fit], model: _Model, gain: float) -> tuple[_Model, Problem, Fit]:
-        new = tried(model)
-        return new if now[2].deviance - new[2].deviance > gain else now
-
-    best = tried(_Model())
-    best = better(best, replace(best[0], ramp=True), _TERM_SHOWS)
-    best = better(best, replace(best[0], terms=(0, 1, 2, 3)), _TERM_SHOWS)
-    times = np.geomspace(_MARKOV_CORNER / (2 * np.pi * f_max), s.durations_s.max() / 20, _MARKOV_STEPS)
-
-    def deviance(log_time: float) -> float:
-        return tried(replace(best[0], markov_s=float(np.exp(log_time))))[2].deviance
-
-    at = int(np.argmin([deviance(t) for t in np.log(times)]))
-    bounds = (float(np.log(times[max(at - 1, 0)])), float(np.log(times[min(at + 1, len(times) - 1)])))
-    time = float(np.exp(minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 0.02}).x))
-    return better(best, replace(best[0], markov_s=time), _MARKOV_SHOWS)
-
-
-def _damped(f: Array, weight: Array, delta: float) -> Array:
-    """Return weights for a model that is off by delta from half octave to half octave: n modes count as n / (1 + n delta^2 / 2)."""
-    group = half_octaves(f, f.min())
-    damped: Array = weight / (1 + np.bincount(group, weight)[group] * delta**2 / 2)
-    return damped
-
-
-def _axis(s: Spectrum, model: _Model, p: Problem, fit: Fit, unit: float, f_max: float, features: list[Feature], delta: float) -> AxisNoise:
+def _axis(s: Spectrum, model: Model, p: Problem, fit: Fit, unit: float, f_max: float, features: list[Feature], delta: float) -> AxisNoise:
     hours = float(s.durations_s.sum()) / 3600
     found = misfits(p, fit, s)
-    features = [f.scaled(unit) for f in features]
     spans = [interval(p, fit, i) for i in range(len(model.terms))]
     needed = [
         None if span.resolved else hours_to_resolve(fit.theta, spans, model.terms, i, hours, f_max, s.rate_hz)
@@ -219,19 +156,12 @@ def _axis(s: Spectrum, model: _Model, p: Problem, fit: Fit, unit: float, f_max: 
         best=best,
         covariance=variance / (4 * root[:, None] * root) * unit**2,
         f_max=f_max,
-        features=tuple(features),
+        features=tuple(f.scaled(unit) for f in features),
         misfit=tuple(found),
         goodness=goodness(found),
         discrepancy=delta,
-        reasons=tuple(_reasons(features, markov, delta)),
+        reasons=(),
     )
-
-
-def _reasons(features: Sequence[Feature], markov: Markov | None, delta: float) -> list[str]:
-    texts = [f.text for f in features] + ([markov.text] if markov else [])
-    if delta > 0:
-        texts.append(f"the noise terms describe this spectrum to {100 * delta:.2g} % of power only; the intervals allow for that")
-    return texts
 
 
 def _term(span: Interval, unit: float, needed: tuple[float, float] | None) -> NoiseTerm:

@@ -37,15 +37,6 @@ class Feature:
     def scaled(self, unit: float) -> "Feature":
         return replace(self, amplitude=self.amplitude * unit)
 
-    @property
-    def text(self) -> str:
-        if self.kind == "line":
-            where = f"{np.sqrt(self.f_low * self.f_high):.3g} Hz"
-            seen = f"amplitude {self.amplitude:.2g}, a bump in the Allan deviation near tau {self.tau:.2g} s"
-            return f"periodic at {where}, {seen}; left out of the fit"
-        what = "falls off (a low-pass filter)" if self.kind == "filter" else "rises above what noise terms describe"
-        return f"the spectrum {what} beyond {self.f_low:.3g} Hz; left out of the fit, so N is that of tau > {self.tau:.2g} s"
-
 
 @dataclass(frozen=True)
 class Misfit:

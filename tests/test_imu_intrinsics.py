@@ -252,6 +252,10 @@ def test_too_little_is_refused(usual: MultiPosition) -> None:
         calibrate_imu(usual.t[short], usual.gyro[short], usual.accel[short], 9.81)
     with pytest.raises(BadInputError, match="5 samples"):
         calibrate_imu(usual.t[:5], usual.gyro[:5], usual.accel[:5], 9.81)
+    with pytest.raises(BadInputError, match="imu0: 0 samples"):
+        calibrate_imu(usual.t[:0], usual.gyro[:0], usual.accel[:0], 9.81)
+    with pytest.raises(BadInputError, match="not finite"):
+        calibrate_imu(usual.t, usual.gyro * np.nan, usual.accel, 9.81)
 
 
 def test_jacobian_of_all_rows(usual: MultiPosition) -> None:

@@ -84,6 +84,10 @@ class CameraProblem:
         start = self.lens_slices[-1].stop + 6 * (camera - 1)
         return slice(start, start + 6)
 
+    def has_prior(self, lenses: Sequence[Array]) -> bool:
+        """Whether any of the lenses has a prior."""
+        return any(len(camera.model.prior(lens, camera.reach)[0]) > 0 for camera, lens in zip(self.cameras, lenses, strict=True))
+
     def prior(self, lenses: Sequence[Array]) -> tuple[float, Array, Array]:
         """Return what the lenses' priors add to the cost, to the information (p, p) about the border and to its gradient (p,)."""
         cost, C, g = 0.0, np.zeros((self.border_size, self.border_size)), np.zeros(self.border_size)

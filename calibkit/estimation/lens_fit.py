@@ -186,7 +186,7 @@ def _solve(
         # From px-wide tolerance inwards: the noise is unknown until most corners fit.
         for _ in range(_ROBUST_ROUNDS):
             scale = _noise(problem, state)
-            problem = _weigh_prior(problem, state, scale)
+            problem = _weigh_prior(problem, state)
             solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x
             good, grids = _judge_views(used, problem, state, found, dropped)
@@ -196,15 +196,15 @@ def _solve(
             found = [weight[keep] for weight, keep in zip(found, good, strict=True)]
             rows = [row[keep] for row, keep in zip(rows, good, strict=True)]
         # Corners given up at the robust end may come back at the plain one; where there is a prior, that it pulls less may bring more.
-        for _ in range(3 if problem.prior(state.lenses)[0] else 2):
+        for _ in range(3 if problem.has_prior(state.lenses) else 2):
             problem = _give_up_corners(problem, state, found)
-            problem = _weigh_prior(problem, state, _noise(problem, state))
+            problem = _weigh_prior(problem, state)
             solution = minimise(problem, state)
             state = solution.x
     else:
-        solution = minimise(_weigh_prior(problem, state, 1.0), state)
-        problem = _weigh_prior(problem, solution.x, _noise(problem, solution.x))
-        if problem.prior(solution.x.lenses)[0]:
+        solution = minimise(problem, state)
+        if problem.has_prior(solution.x.lenses):
+            problem = _weigh_prior(problem, solution.x)
             solution = minimise(problem, solution.x)
     names = ", ".join(views.camera for views in used)
     for views, lens in zip(used, solution.x.lenses, strict=True):
@@ -229,15 +229,17 @@ def _noise(problem: CameraProblem, state: LensState) -> float:
     return max(scale_of_norms(np.concatenate(norms)), _FINEST)
 
 
-def _weigh_prior(problem: CameraProblem, state: LensState, noise: float) -> CameraProblem:
-    """Return the problem with what the lenses' priors are asked about: the corners' noise in sigmas, and how far out they lie."""
+def _weigh_prior(problem: CameraProblem, state: LensState) -> CameraProblem:
+    """Return the problem with what the lenses' priors are asked about, if there are any: the corners' noise, and how far out they lie."""
+    if not problem.has_prior(state.lenses):
+        return problem
     grids = []
     for c, grid in enumerate(problem.cameras):
         p = se3.transform(state.T_cam_cam0[c] @ state.T_cam0_board[grid.instant], problem.points)[grid.weight > 0]
         p = p[p[:, 2] > _FINEST]
         r2 = (p[:, 0] ** 2 + p[:, 1] ** 2) / p[:, 2] ** 2
         grids.append(replace(grid, reach=float(np.percentile(r2, _OUTERMOST)) if len(r2) else grid.reach))
-    return replace(problem, cameras=tuple(grids), noise=noise)
+    return replace(problem, cameras=tuple(grids), noise=_noise(problem, state))
 
 
 def _judge_views(

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
 
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 STILL_START_S = 10.0
 _LARGE_MISFIT = 2e-3  # of gravity
 _MANY_DROPPED = 0.1
+_CHANCE = 1e-4  # that bias follows gravity so well by chance
 
 
 def advice_for(fit: ImuFit, parameters: Mapping[str, Number]) -> tuple[str, ...]:
@@ -94,4 +96,28 @@ def reasons_for(
     if misfit > _LARGE_MISFIT * gravity:
         text = f"|a| at rest errs by {misfit:.3f} m/s^2 rms: the scale is not constant, or the IMU was not still"
         reasons.append(Reason(Verdict.CHECK, f"{name}: {text}"))
+    sensitivity = _follows_gravity(fit)
+    if sensitivity > 0:
+        text = f"the gyroscope's bias follows gravity's direction, by {sensitivity:.1g} rad/s from one side to the other"
+        reasons.append(Reason(Verdict.CHECK, f"{name}: {text}: it is sensitive to acceleration; estimate that too"))
     return reasons
+
+
+def _follows_gravity(fit: ImuFit) -> float:
+    """Return by how much rad/s the gyroscope's rest value changes as an axis turns from up to down, 0 where chance explains it (F test)."""
+    p = fit.problem
+    n = p.stands
+    if p.size > 21 or n < 2 * NEEDED_POSITIONS:
+        return 0.0
+    r = -p.rows(fit.state).gyro
+    sigma = np.sqrt(np.einsum("nii->ni", p.cov_gyro) + p.weights.wobble**2)
+    most = 0.0
+    for axis in range(3):
+        J = np.column_stack([fit.state.up, np.ones(n)]) / sigma[:, axis, None]
+        y = r[:, axis] / sigma[:, axis]
+        x = np.linalg.lstsq(J, y, rcond=None)[0]
+        left = float(np.sum((y - J @ x) ** 2))
+        constant = float(np.sum((y - J[:, 3] * (J[:, 3] @ y) / (J[:, 3] @ J[:, 3])) ** 2))
+        if left > 0 and f_distribution.sf((constant - left) / 3 / (left / (n - 4)), 3, n - 4) < _CHANCE:
+            most = max(most, 2 * float(np.linalg.norm(x[:3])))
+    return most

@@ -99,7 +99,7 @@ def reasons_for(
     sensitivity = _follows_gravity(fit)
     if sensitivity > 0:
         text = f"the gyroscope's bias follows gravity's direction, by {sensitivity:.1g} rad/s from one side to the other"
-        reasons.append(Reason(Verdict.CHECK, f"{name}: {text}: it is sensitive to acceleration; estimate that too"))
+        reasons.append(Reason(Verdict.CHECK, f"{name}: {text}: it is sensitive to acceleration; estimate that too (--g-sensitivity)"))
     return reasons
 
 

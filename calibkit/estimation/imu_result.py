@@ -9,21 +9,9 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Covariance, Estimate, Imu, ImuIntrinsics, Rig
 from calibkit.data.verdict import Status
 from calibkit.estimation.imu_intrinsics import ImuCalibration
-from calibkit.models.imu import CORRECTION, EQUATION, Gravity
+from calibkit.models.imu import CORRECTION, EQUATION, UNITS, Gravity
 
 Array = NDArray[np.float64]
-
-_UNITS: dict[ImuUnit, dict[str, str]] = {
-    "SI": {"M_a": "", "b_a": "m/s^2", "M_g": "", "phi": "rad", "b_g": "rad/s", "A_g": "rad/s/(m/s^2)"},
-    "counts": {
-        "M_a": "counts/(m/s^2)",
-        "b_a": "counts",
-        "M_g": "counts/(rad/s)",
-        "phi": "rad",
-        "b_g": "counts",
-        "A_g": "counts/(m/s^2)",
-    },
-}
 
 
 def imu_result(
@@ -34,7 +22,7 @@ def imu_result(
     sigma = dict(zip(found.names, np.sqrt(np.diag(cov)).tolist(), strict=True))
     parameters = {
         key: Estimate(
-            value=number.value, unit=_UNITS[unit][key[:3]], sigma=sigma.get(key), sigma_plain=number.sigma_plain, status=number.status
+            value=number.value, unit=UNITS[unit][key[:3]], sigma=sigma.get(key), sigma_plain=number.sigma_plain, status=number.status
         )
         for key, number in found.parameters.items()
     }

@@ -26,6 +26,17 @@ GYRO_PARAMETERS = (*(f"M_g_{k}" for k in LOWER), *(f"phi_g_i_{k}" for k in AXES)
 SENSITIVITY_PARAMETERS = tuple(f"A_g_{r}{c}" for r in AXES for c in AXES)
 PARAMETERS = (*ACCEL_PARAMETERS, *GYRO_PARAMETERS, *SENSITIVITY_PARAMETERS)
 EQUATION = "a_meas = M_a a_i + b_a; w_meas = M_g C_g_i w_i + A_g C_g_i a_i + b_g, C_g_i = exp(phi_g_i), M lower triangular"
+UNITS: dict[str, dict[str, str]] = {  # by what the IMU speaks and the first three letters of a parameter's name
+    "SI": {"M_a": "", "b_a": "m/s^2", "M_g": "", "phi": "rad", "b_g": "rad/s", "A_g": "rad/s/(m/s^2)"},
+    "counts": {
+        "M_a": "counts/(m/s^2)",
+        "b_a": "counts",
+        "M_g": "counts/(rad/s)",
+        "phi": "rad",
+        "b_g": "counts",
+        "A_g": "counts/(m/s^2)",
+    },
+}
 CORRECTION = "a_i = M_a^-1 (a_meas - b_a); w_i = C_g_i^T M_g^-1 (w_meas - b_g - A_g C_g_i a_i)"
 
 _ROWS, _COLUMNS = np.tril_indices(3)

@@ -1,12 +1,15 @@
 """A rig with something in every field, and asymmetric in every frame, for the tests of files."""
 
+from typing import Any
+
 import numpy as np
 
-from calibkit.data.rig import Camera, Estimate, Imu, InputFile, Reprojection, Rig, StageRun
+from calibkit.data.rig import Camera, Estimate, Imu, ImuIntrinsics, InputFile, Reprojection, Rig, StageRun
 from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
 from calibkit.data.verdict import Status, Verdict
 from calibkit.geometry import se3, so3
 from calibkit.models.cameras import CAMERAS
+from calibkit.models.imu import CORRECTION, EQUATION, UNITS, ImuModel
 
 T_CAM0_IMU0 = se3.make(so3.exp(np.array([0.4, -1.1, 0.7])), np.array([0.03, -0.05, 0.11]))
 T_CAM1_CAM0 = se3.make(so3.exp(np.array([-0.02, 0.05, 0.01])), np.array([-0.11, 0.002, -0.004]))
@@ -17,6 +20,23 @@ LENSES = {
     "pinhole-equi": [190.978, 190.973, 254.932, 256.897, 0.0034823894, 0.0007150348, -0.0020532361, 0.0002029367],
 }
 SIZES = {"pinhole-radtan": (752, 480), "pinhole-radtan5": (1920, 1200), "pinhole-radtan8": (640, 480), "pinhole-equi": (512, 512)}
+IMU_MODEL = ImuModel(  # nothing symmetric, and far enough from ideal that an inverse or a transpose shows
+    M_a=np.array([[1.03, 0, 0], [0.02, 0.96, 0], [-0.015, 0.011, 1.05]]),
+    b_a=np.array([0.3, -0.2, 0.1]),
+    M_g=np.array([[0.97, 0, 0], [-0.013, 1.04, 0], [0.017, 0.009, 1.01]]),
+    C_g_i=so3.exp(np.array([0.3, -0.2, 0.5])),
+    b_g=np.array([0.01, -0.02, 0.03]),
+    A_g=np.array([[1e-3, 2e-3, -3e-3], [4e-3, -5e-3, 6e-3], [7e-3, 8e-3, -9e-3]]),
+)
+
+
+def imu_intrinsics(model: ImuModel = IMU_MODEL, **more: Any) -> ImuIntrinsics:
+    """What `calibkit imu` would write of this model."""
+    parameters = {
+        name: Estimate(value=value, unit=UNITS["SI"][name[:3]], sigma=1e-4, status=Status.DETERMINED)
+        for name, value in model.values().items()
+    }
+    return ImuIntrinsics(equation=EQUATION, correction=CORRECTION, **{"gravity": 9.81744, "parameters": parameters} | more)
 
 
 def camera(model: str, topic: str | None = None) -> Camera:

@@ -10,15 +10,16 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutate import mutated, read_or_refused
-from rigs import T_CAM0_IMU0, T_CAM1_CAM0, full_rig
+from rigs import IMU_MODEL, T_CAM0_IMU0, T_CAM1_CAM0, full_rig, imu_intrinsics
 
-from calibkit.data.rig import Rig
+from calibkit.data.rig import Estimate, Imu, Rig
 from calibkit.data.transforms import find_transform, make_transform
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
-from calibkit.geometry import se3
+from calibkit.geometry import se3, so3
 from calibkit.io.rig_file import dump_rig, load_rig, save_rig
 from calibkit.models.cameras import CAMERAS
+from calibkit.models.imu import PARAMETERS, ImuModel
 from calibkit.stages.convert import export_rig, import_files
 
 CHAIN = {
@@ -54,6 +55,18 @@ IMU = {
     "rostopic": "/imu0",
     "update_rate": 200.0,
 }
+
+C_GYRO_I = so3.exp(np.array([0.02, -0.03, 0.01]))
+INTRINSICS = {
+    "model": "scale-misalignment",
+    "accelerometers": {"M": [[1.01, 0.0, 0.0], [0.002, 0.99, 0.0], [-0.003, 0.004, 1.02]]},
+    "gyroscopes": {
+        "M": [[0.98, 0.0, 0.0], [0.005, 1.03, 0.0], [-0.006, 0.007, 1.01]],
+        "A": [[1e-4, 2e-4, -3e-4], [4e-4, -5e-4, 6e-4], [7e-4, 8e-4, -9e-4]],
+        "C_gyro_i": C_GYRO_I.tolist(),
+    },
+}
+PLACES = (("accelerometers", "M"), ("gyroscopes", "M"), ("gyroscopes", "A"), ("gyroscopes", "C_gyro_i"))
 
 
 def brought_in(folder: Path, *contents: Any) -> tuple[Rig, str]:
@@ -157,6 +170,77 @@ def test_export_and_import_come_back_to_the_same_pixel(tmp_path: Path, point: An
     assert again.imus["imu0"].rate_hz == 200.0
 
 
+def test_exported_intrinsics_measure_as_kalibr_means_them(tmp_path: Path) -> None:
+    """IccSensors.py: a = M a_i, w = M C_gyro_i w_i + A C_gyro_i a_i; the biases are Kalibr's own to estimate."""
+    save_rig(Rig(imus={"imu0": Imu(intrinsics=imu_intrinsics())}), tmp_path / "rig.yaml")
+    outcome = export_rig(tmp_path / "rig.yaml", "kalibr", tmp_path / "out")
+    node = yaml.safe_load((tmp_path / "out" / "imu.yaml").read_text())
+    assert node["model"] == "scale-misalignment"
+    assert not {"gyroscope_noise_density", "update_rate"} & node.keys()
+    M_a, M, A, C = (np.array(node[part][key]) for part, key in PLACES)
+    accel, omega = np.random.default_rng(4).normal(size=(2, 20, 3)) * [[[9.0]], [[2.0]]]
+    for a_i, w_i in zip(accel, omega, strict=True):
+        a_meas, w_meas = IMU_MODEL.measure(a_i, w_i)
+        np.testing.assert_allclose(M_a @ a_i, a_meas - IMU_MODEL.b_a, atol=1e-12)
+        np.testing.assert_allclose(M @ (C @ w_i) + A @ (C @ a_i), w_meas - IMU_MODEL.b_g, atol=1e-12)
+    assert sum("its biases are not written" in note for note in outcome.notes) == 1
+    again = import_files(outcome.files, tmp_path / "again.yaml").rig.imus["imu0"].intrinsics
+    assert again is not None
+    assert {entry.status for entry in again.parameters.values()} == {Status.GIVEN}
+    values = IMU_MODEL.values() | {key: 0.0 for key in PARAMETERS if key.startswith("b_")}
+    for key, value in values.items():
+        assert again.parameters[key].value == pytest.approx(value, abs=1e-14)
+
+
+def test_imported_intrinsics_are_kalibrs_numbers(tmp_path: Path) -> None:
+    rig, notes = brought_in(tmp_path, {"imu0": {**IMU, **INTRINSICS}})
+    found = rig.imus["imu0"].intrinsics
+    assert found is not None
+    model = ImuModel.of({key: entry.value or 0.0 for key, entry in found.parameters.items()})
+    for ours, (part, key) in zip((model.M_a, model.M_g, model.A_g, model.C_g_i), PLACES, strict=True):
+        np.testing.assert_allclose(ours, INTRINSICS[part][key], atol=1e-15)
+    assert found.gravity == 9.80655  # Kalibr's own constant
+    assert found.reasons[0] in notes
+
+
+def test_identities_stand_for_no_intrinsics(tmp_path: Path) -> None:
+    eye, zero = np.eye(3).tolist(), np.zeros((3, 3)).tolist()
+    ideal = {"model": "calibrated", "accelerometers": {"M": eye}, "gyroscopes": {"M": eye, "C_gyro_i": eye, "A": zero}}
+    rig, notes = brought_in(tmp_path, {"imu0": {**IMU, **ideal}})
+    assert rig.imus["imu0"].intrinsics is None
+    assert notes == ""
+
+
+def test_an_imu_file_of_intrinsics_alone_is_recognised(tmp_path: Path) -> None:
+    rig, _ = brought_in(tmp_path, INTRINSICS)
+    assert rig.imus["imu0"].intrinsics is not None
+    assert rig.imus["imu0"].gyro_noise_density is None
+
+
+def test_raw_counts_stay_behind_with_a_note(tmp_path: Path) -> None:
+    imu = full_rig().imus["imu0"].model_copy(update={"intrinsics": imu_intrinsics(unit="counts")})
+    save_rig(Rig(imus={"imu0": imu}), tmp_path / "rig.yaml")
+    outcome = export_rig(tmp_path / "rig.yaml", "kalibr", tmp_path / "out")
+    node = yaml.safe_load((tmp_path / "out" / "imu.yaml").read_text())
+    assert not {"model", "gyroscopes", "accelerometers"} & node.keys()
+    assert node["gyroscope_noise_density"] == 1.6968e-4
+    assert any("imu0: intrinsics in raw counts are not written, Kalibr takes SI" in note for note in outcome.notes)
+
+
+@pytest.mark.parametrize("to", ["kalibr", "openvins"])
+def test_intrinsics_that_are_not_observable_do_not_leave(tmp_path: Path, to: str) -> None:
+    parameters = dict(imu_intrinsics().parameters)
+    unknown = Estimate(value=None, status=Status.NOT_OBSERVABLE)
+    allowed = imu_intrinsics(parameters={**parameters, "b_g_x": unknown})  # a bias is not written anyway
+    save_rig(Rig(imus={"imu0": Imu(intrinsics=allowed)}), tmp_path / "rig.yaml")
+    assert export_rig(tmp_path / "rig.yaml", to, tmp_path / "biases").files
+    refused = imu_intrinsics(parameters={**parameters, "M_a_zz": unknown})
+    save_rig(Rig(imus={"imu0": Imu(intrinsics=refused)}), tmp_path / "rig.yaml", force=True)
+    with pytest.raises(BadInputError, match=r"^imus.imu0.intrinsics.parameters.M_a_zz is marked 'not observable' and cannot be exported"):
+        export_rig(tmp_path / "rig.yaml", to, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_every_number_that_is_written_is_a_float_to_kalibrs_reader(tmp_path: Path) -> None:
     save_rig(full_rig(), tmp_path / "rig.yaml")
     export_rig(tmp_path / "rig.yaml", "kalibr", tmp_path / "out")
@@ -172,7 +256,7 @@ def test_cameras_by_other_names_are_numbered_and_said(tmp_path: Path) -> None:
     left = Rig(cameras={"left": rig.cameras["cam0"]}, transforms={"T_imu0_left": make_transform("imu0", "left", se3.inverse(T_CAM0_IMU0))})
     save_rig(left, tmp_path / "rig.yaml")
     outcome = export_rig(tmp_path / "rig.yaml", "kalibr", tmp_path / "out")
-    assert "left is written as cam0, as Kalibr names cameras" in outcome.notes
+    assert "left is written as cam0, as Kalibr names sensors" in outcome.notes
     np.testing.assert_allclose(yaml.safe_load(outcome.files[0].read_text())["cam0"]["T_cam_imu"], T_CAM0_IMU0, atol=1e-15)
 
 
@@ -207,6 +291,12 @@ def changed(camera: str, **values: Any) -> dict[str, Any]:
     return {**CHAIN, camera: node}
 
 
+def intrinsics(part: str, **values: Any) -> dict[str, Any]:
+    """Return an IMU with keys of its intrinsics set, or dropped where None."""
+    node = {k: v for k, v in {**INTRINSICS[part], **values}.items() if v is not None}
+    return {"imu0": {**IMU, **INTRINSICS, part: node}}
+
+
 @pytest.mark.parametrize(
     ("chain", "message"),
     [
@@ -239,6 +329,22 @@ def changed(camera: str, **values: Any) -> dict[str, Any]:
         ({**CHAIN, "cam0": [1]}, "cam0: holds no keys"),
         ({"imu0": {**IMU, "update_rate": 0}}, "imu0.update_rate: a rate is positive"),
         ({**IMU, "gyroscope_noise_density": -1.0}, "gyroscope_noise_density: a noise density is not negative"),
+        (
+            intrinsics("accelerometers", M=[[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+            "line 5: imu0.accelerometers.M: is not lower",
+        ),
+        (intrinsics("accelerometers", M=None), "imu0.accelerometers.M: is missing"),
+        (intrinsics("gyroscopes", M=np.diag([1.0, -1.0, 1.0]).tolist()), "imu0.gyroscopes.M: has a scale that is not positive"),
+        (
+            intrinsics("gyroscopes", M=np.diag([1.0, 4096.0, 1.0]).tolist()),
+            "imu0.gyroscopes.M: has an entry beyond 100, which no IMU in SI has",
+        ),
+        (intrinsics("gyroscopes", C_gyro_i=np.diag([1.0, 1.0, -1.0]).tolist()), "imu0.gyroscopes.C_gyro_i: its matrix is not a rotation"),
+        (intrinsics("gyroscopes", A=[[1e-4, 2e-4]]), "imu0.gyroscopes.A: has 2 numbers; it needs 9"),
+        (
+            {"imu0": {**IMU, **INTRINSICS, "Tw": np.diag([1.0, 1.0, 1.1]).tolist()}},
+            "imu0: holds intrinsics in Kalibr's keys and in OpenVINS'",
+        ),
         ({"a": 1}, "is in no known format"),
         ({"cam٣": CHAIN["cam0"]}, "is in no known format"),
     ],
@@ -263,7 +369,14 @@ def test_what_is_wrong_is_refused_with_line_and_key(tmp_path: Path, chain: dict[
             "cam0.T_cam_imu: its rotation is off by .* the nearest rotation is taken",
         ),
         (changed("cam1", T_cam_imu=np.eye(4).tolist()), "cam1: T_cn_cnm1 and the T_cam_imu of cam1 and cam0 disagree by"),
-        ({"imu0": {**IMU, "gyroscopes": {"M": np.diag([1.0, 1.01, 1]).tolist()}}}, r"imu0: gyroscopes \(IMU intrinsics\) have no place"),
+        (
+            {"imu0": {**IMU, **INTRINSICS}},
+            r"imu0: Kalibr's file holds neither biases nor gravity: taken as 0 and 9.80655 m/s\^2",
+        ),
+        (
+            {"imu0": {**IMU, "accelerometers": {"M": np.eye(3).tolist(), "rx_i": [0.0, 0.0, 0.0], "ry_i": [0.01, 0.0, 0.0]}}},
+            r"imu0: accelerometers.rx_i, accelerometers.ry_i has no place in the rig file; not taken over",
+        ),
     ],
 )
 def test_what_is_suspicious_is_said(tmp_path: Path, chain: dict[str, Any], message: str) -> None:
@@ -312,10 +425,20 @@ def test_the_published_euroc_mounting(tmp_path: Path, data_dir: Path) -> None:
     np.testing.assert_allclose(found[0][:3, 3], [-0.0216401454975, -0.064676986768, 0.00981073058949], atol=1e-9)
 
 
+OPENVINS = {
+    "model": "kalibr",
+    "Tw": INTRINSICS["gyroscopes"]["M"],
+    "R_IMUtoGYRO": C_GYRO_I.tolist(),
+    "Ta": INTRINSICS["accelerometers"]["M"],
+    "R_IMUtoACC": np.eye(3).tolist(),
+    "Tg": INTRINSICS["gyroscopes"]["A"],
+}
 TEXTS = [
     yaml.safe_dump(CHAIN, sort_keys=False),
     yaml.safe_dump({"imu0": {**IMU, "T_i_b": np.eye(4).tolist(), "time_offset": 0.0}}),
     yaml.safe_dump(IMU),
+    yaml.safe_dump({"imu0": {**IMU, **INTRINSICS}}),
+    yaml.safe_dump({"imu0": OPENVINS}),
 ]
 
 
@@ -327,4 +450,5 @@ def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, content: 
     if outcome is not None:
         assert load_rig(tmp_path / "rig.yaml") == outcome.rig
         assert all(note.isprintable() for note in outcome.notes)
-        read_or_refused(lambda: export_rig(tmp_path / "rig.yaml", "kalibr", tmp_path / "out", force=True))
+        for to in ("kalibr", "openvins"):
+            read_or_refused(lambda to=to: export_rig(tmp_path / "rig.yaml", to, tmp_path / "out", force=True))

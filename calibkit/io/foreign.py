@@ -1,6 +1,6 @@
 """What all importers and exporters share: typed access to a foreign file's values, and cameras as bare parameters."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,16 +112,21 @@ def rigid_at(document: Document, keys: Keys, warnings: list[str]) -> Array | Non
     R = T[:3, :3]
     if np.abs(T[3] - [0, 0, 0, 1]).max() > _ROUNDING:
         raise document.error(keys, "the last row is not 0 0 0 1; write the transform row by row")
-    off = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 2 else np.inf
-    if off > _NO_ROTATION or np.linalg.det(R) < 0:
-        raise document.error(keys, "the upper left 3 x 3 is not a rotation; check its numbers")
     if np.abs(T[:3, 3]).max() > 1e6:
         raise document.error(keys, "the last column is no translation in metres; check its numbers")
-    if off > _ROUNDING:
-        warnings.append(f"{'.'.join(map(str, keys))}: its rotation is off by {off:.1g} from orthonormal; the nearest rotation is taken")
-    T[:3, :3] = so3.project(R)
+    T[:3, :3] = rotation_of(document, keys, R, "the upper left 3 x 3", warnings)
     T[3] = [0, 0, 0, 1]
     return T
+
+
+def rotation_of(document: Document, keys: Keys, R: Array, what: str, warnings: list[str]) -> Array:
+    """Return the rotation nearest to R (3, 3), which `what` names; refuse what is none and say what was off."""
+    off = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 2 else np.inf
+    if off > _NO_ROTATION or np.linalg.det(R) < 0:
+        raise document.error(keys, f"{what} is not a rotation; check its numbers")
+    if off > _ROUNDING:
+        warnings.append(f"{'.'.join(map(str, keys))}: its rotation is off by {off:.1g} from orthonormal; the nearest rotation is taken")
+    return so3.project(R)
 
 
 def quote(value: object) -> str:
@@ -179,6 +184,17 @@ def refuse_unobservable(name: str, status: Status) -> None:
 def without_place(rig: Rig, *sections: str) -> list[str]:
     """Return the note on what a format does not hold: sigmas, and these sections of the rig."""
     lost = [section.replace("_", " ") for section in sections if getattr(rig, section)]
-    if any(e.sigma is not None for camera in rig.cameras.values() for e in camera.parameters.values()):
+    if any(e.sigma is not None for e in _estimates(rig)):
         lost.insert(0, "sigmas and covariances")
+    if "imus" not in sections and any(imu.noise for imu in rig.imus.values()):
+        lost.append("the noise of each axis")
     return [f"not written, the format has no place for them: {', '.join(lost)}"] if lost else []
+
+
+def _estimates(rig: Rig) -> Iterator[Estimate]:
+    for camera in rig.cameras.values():
+        yield from camera.parameters.values()
+    for imu in rig.imus.values():
+        densities = (imu.gyro_noise_density, imu.gyro_random_walk, imu.accel_noise_density, imu.accel_random_walk)
+        yield from (density for density in densities if density is not None)
+        yield from imu.intrinsics.parameters.values() if imu.intrinsics else ()

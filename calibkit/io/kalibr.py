@@ -15,7 +15,7 @@ from calibkit.data.rig import Camera, Estimate, Imu, Rig, TimeOffset, Transform
 from calibkit.data.transforms import make_time_offset, make_transform
 from calibkit.errors import one_line
 from calibkit.geometry import se3
-from calibkit.io import foreign
+from calibkit.io import foreign, imu_keys
 from calibkit.io.foreign import Imported, Importer
 from calibkit.io.yaml_file import Document
 from calibkit.models.cameras import CAMERAS
@@ -41,14 +41,14 @@ NOISE = {  # Kalibr's key -> our field and its unit
 }
 _LENS_KEYS = ("camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution")
 _CAMERA_KEYS = (*_LENS_KEYS, "rostopic", "cam_overlaps", "T_cn_cnm1", "T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
-_IMU_KEYS = (*NOISE, "rostopic", "update_rate", "T_i_b", "time_offset")
-_IMU_MODEL_KEYS = ("model", "gyroscopes", "accelerometers", "Tw", "Ta", "Tg", "R_IMUtoGYRO", "R_IMUtoACC")
+_IMU_KEYS = (*NOISE, "rostopic", "update_rate", "T_i_b", "time_offset", *imu_keys.NAMES)
+_RECOGNISED = (*NOISE, "accelerometers", "gyroscopes", "Tw", "Ta", "Tg")  # of a file that holds the keys of one IMU without its name
 _SENSOR = re.compile(r"(cam|imu)[0-9]{1,3}")  # not \d: other scripts' digits make no name of a rig file
 _DISAGREE_RAD, _DISAGREE_M = 2e-3, 2e-3  # beyond rounding, between T_cn_cnm1 and the two T_cam_imu
 
 
 def _recognises(data: Mapping[str, Any]) -> bool:
-    return any(_SENSOR.fullmatch(key) for key in data) or any(key in data for key in NOISE)
+    return any(_SENSOR.fullmatch(key) for key in data) or any(key in data for key in _RECOGNISED)
 
 
 def _read(document: Document, so_far: Rig) -> Imported:
@@ -130,8 +130,8 @@ def _lens(document: Document, name: str, keys: tuple[str, ...]) -> Camera:
 
 def _read_imu(document: Document, name: str, keys: tuple[str, ...], parts: _Parts, warnings: list[str]) -> None:
     _, imus, transforms, offsets = parts
-    _check_names(document, keys, (*_IMU_KEYS, *_IMU_MODEL_KEYS), warnings)
-    imus[name] = _noise(document, keys)
+    _check_names(document, keys, _IMU_KEYS, warnings)
+    imus[name] = _noise(document, keys).model_copy(update={"intrinsics": imu_keys.read(document, name, keys, warnings)})
     T_i_b = foreign.rigid_at(document, (*keys, "T_i_b"), warnings)
     offset = foreign.number_at(document, (*keys, "time_offset"))
     if name != "imu0":
@@ -141,22 +141,6 @@ def _read_imu(document: Document, name: str, keys: tuple[str, ...], parts: _Part
             offsets[f"dt_imu0_{name}"] = make_time_offset("imu0", name, Estimate(value=offset, unit="s"))
     elif offset or (T_i_b is not None and not np.allclose(T_i_b, np.eye(4))):
         warnings.append("imu0: T_i_b or time_offset differs from identity, though imu0 is Kalibr's reference; not taken over")
-    lost = [key for key in _IMU_MODEL_KEYS if not _neutral(foreign.value_at(document, (*keys, key)))]
-    if lost:
-        warnings.append(f"{name}: {', '.join(lost)} (IMU intrinsics) have no place in the rig file yet; not taken over")
-
-
-def _neutral(value: Any) -> bool:
-    """Say whether a part of Kalibr's IMU model changes nothing: texts, zeros, identities."""
-    if isinstance(value, dict):
-        return all(_neutral(part) for part in value.values())
-    if not isinstance(value, list):
-        return value is None or isinstance(value, str) or value == 0
-    rows = [row for row in value if isinstance(row, list) and all(type(item) in (int, float) for item in row)]
-    if len(rows) != len(value) or len({len(row) for row in rows}) != 1:
-        return False
-    matrix = np.array(rows, float)
-    return bool(np.array_equal(matrix, np.eye(*matrix.shape)) or not matrix.any())
 
 
 def _noise(document: Document, keys: tuple[str, ...]) -> Imu:

@@ -3,7 +3,6 @@
 import csv
 import io
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,21 +80,15 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     return replace(saved, files=(*saved.files, options.table))
 
 
-def _channels(samples: ImuSamples) -> Array:
-    return np.hstack([samples.gyro, samples.accel])
-
-
 def _fit(pieces: Sequence[ImuSamples], rate: float, progress: Progress) -> list[AxisNoise]:
-    """Return the noise of every axis, two at a time: most of the work frees the interpreter's lock."""
-    channels = [_channels(piece) for piece in pieces]
-    n = channels[0].shape[1]
-    with ThreadPoolExecutor() as pool:
-        found = pool.map(lambda axis: fit_noise([x[:, axis : axis + 1] for x in channels], rate)[0], range(n))
-        return list(progress(found, "noise of each axis", n))
+    """Return the noise of every axis, one after the other: each takes several times its samples' memory."""
+    sensors = [[array for array in (piece.gyro, piece.accel) if array.shape[1]] for piece in pieces]
+    axes = [[sensor[k][:, axis : axis + 1] for sensor in sensors] for k in range(len(sensors[0])) for axis in range(3)]
+    return [fit_noise(x, rate)[0] for x in progress(axes, "noise of each axis", len(axes))]
 
 
 def _deviation(samples: ImuSamples, rate: float, kind: str, exact: bool) -> Deviation:
-    x = _channels(samples)
+    x = np.hstack([samples.gyro, samples.accel])
     return deviation(x, rate, log_spaced(len(x), rate), kind, exact)
 
 

@@ -162,3 +162,67 @@ def test_mistakes_are_one_line(run: Run, made: MultiPosition, recording: Path, t
     assert "--gyro-unit furlongs" in run("imu", recording, "--gyro-unit", "furlongs").mistake
     assert "which imu topic" in run("imu", recording, tmp_path / "short.csv").mistake
     assert not list(tmp_path.glob("*.npz"))
+
+
+def table_rates(path: Path, runs: list[tuple[float, Array]], unit: str = "deg/s") -> Path:
+    """Write the rates of runs (begin s, axis) of 20 s each: 0, +60, -60, 0 deg/s at 0, 5, 15, 20 s."""
+    scale = 1.0 if unit == "deg/s" else np.pi / 180
+    lines = [f"t [s],rate [{unit}],run,nx,ny,nz"]
+    for k, (begin, n) in enumerate(runs):
+        lines += [f"{begin + dt:.3f},{rate * scale:.9f},{k},{n[0]},{n[1]},{n[2]}" for dt, rate in ((0, 0), (5, 60), (15, -60), (20, 0))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def on_the_table(begin: float, n: Array, model: ImuModel, rng: np.random.Generator) -> Array:
+    """Return samples (k, 7) of one run at 50 Hz."""
+    t = np.arange(begin, begin + 20, 0.02)
+    rate = np.radians(np.interp(t - begin, [0, 5, 15, 20], [0, 60, -60, 0]))
+    accel, gyro = model.measure(np.tile([0.0, 0.0, G], (len(t), 1)), rate[:, None] * n)
+    return np.column_stack([t, gyro + 2e-3 * rng.standard_normal(gyro.shape), accel + 0.02 * rng.standard_normal(accel.shape)])
+
+
+def test_a_turntable_tells_the_gyroscopes_scale(run: Run, made: MultiPosition, tmp_path: Path) -> None:
+    rng, header = np.random.default_rng(0), "t [s],wx,wy,wz,ax,ay,az"
+    axes = np.eye(3)
+    begins = [made.t[-1] + 2 + 25 * k for k in range(3)]
+    spun = np.concatenate([on_the_table(begin, n, made.model, rng) for begin, n in zip(begins, axes, strict=True)])
+    stands = np.column_stack([made.t, made.gyro, made.accel])
+    np.savetxt(tmp_path / "both.csv", np.concatenate([stands, spun]), "%.9f", ",", header=header, comments="")
+    rates = table_rates(tmp_path / "rates.csv", list(zip(begins, axes, strict=True)))
+    common = (tmp_path / "both.csv", "--gravity", G)
+    run("imu", *common, "-o", tmp_path / "without.yaml")
+    said = run("imu", *common, "--turntable", rates, "-o", tmp_path / "with.yaml")
+    assert said.code == 0, said
+    without, found = intrinsics(tmp_path / "without.yaml").parameters, intrinsics(tmp_path / "with.yaml").parameters
+    truth = made.model.values()
+    for name in ("M_g_xx", "M_g_yx", "M_g_yy", "M_g_zx", "M_g_zy", "M_g_zz", "phi_g_i_z", "M_a_xx"):
+        sigma, value = found[name].sigma, found[name].value
+        assert sigma is not None
+        assert value == pytest.approx(truth[name], abs=4.5 * sigma), name
+        assert sigma <= without[name].sigma
+    assert "disagree" not in said.out
+    twice = table_rates(tmp_path / "twice.csv", list(zip(begins, axes, strict=True)), unit="rad/s")
+    twice.write_text(twice.read_text().replace("[rad/s]", "[deg/s]"))  # rates 57 times too small
+    assert "turntable and stands disagree" in run("imu", *common, "--turntable", twice).out
+
+
+def test_a_turntable_alone_tells_no_accelerometer(run: Run, tmp_path: Path) -> None:
+    rng, axes = np.random.default_rng(1), np.eye(3)
+    begins = [100.0, 125.0, 150.0]
+    spun = np.concatenate([on_the_table(begin, n, ODD, rng) for begin, n in zip(begins, axes, strict=True)])
+    np.savetxt(tmp_path / "table.csv", spun, "%.9f", ",", header="t [s],wx,wy,wz,ax,ay,az", comments="")
+    rates = table_rates(tmp_path / "rates.csv", list(zip(begins, axes, strict=True)))
+    said = run("imu", tmp_path / "table.csv", "--turntable", rates, "-o", tmp_path / "rig.yaml")
+    assert said.code == 3, said
+    found = intrinsics(tmp_path / "rig.yaml").parameters
+    assert found["M_a_xx"].value is None
+    assert found["phi_g_i_x"].value is None
+    for name in ("M_g_xx", "M_g_zy", "M_g_zz"):
+        assert found[name].value == pytest.approx(ODD.values()[name], abs=4.5 * (found[name].sigma or 0))
+    assert run("report", tmp_path / "rig.yaml").code == 1
+    late = table_rates(tmp_path / "late.csv", [(begin + 1000, n) for begin, n in zip(begins, axes, strict=True)])
+    assert "on the IMU's clock" in run("imu", tmp_path / "table.csv", "--turntable", late).mistake
+    (tmp_path / "odd.csv").write_text("a,b\n1,2\n")
+    assert "is no table of rates" in run("imu", tmp_path / "table.csv", "--turntable", tmp_path / "odd.csv").mistake
+    assert "is not a file" in run("imu", tmp_path / "table.csv", "--turntable", tmp_path / "absent.csv").mistake

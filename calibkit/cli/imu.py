@@ -36,6 +36,10 @@ def run(
     ] = None,
     latitude: Annotated[float | None, typer.Option("--latitude", metavar="DEG", help="Or where it was, for normal gravity.")] = None,
     altitude: Annotated[float | None, typer.Option("--altitude", metavar="M", help="With --latitude: above the sea.")] = None,
+    turntable: Annotated[
+        Path | None,
+        typer.Option("--turntable", metavar="RATES.csv", help="Known rates on the IMU's clock: columns t, rate [deg/s], run, nx, ny, nz."),
+    ] = None,
     sensitivity: Annotated[
         bool, typer.Option("--g-sensitivity", help="Estimate the gyroscope's sensitivity to acceleration, too.")
     ] = False,
@@ -64,13 +68,14 @@ def run(
     from calibkit.stages.imu import imu as stage
     from calibkit.stages.outputs import Outputs
 
-    refuse_clashes(sources, [out, report, json_file])
+    refuse_clashes([*sources, *([turntable] if turntable else [])], [out, report, json_file])
     refuse_clashes(rig or (), [report, json_file])  # OUT may be a rig: it is then updated
     options = Options(
         imu=imu,
         reading=ImuOptions(rate, gyro_unit, accel_unit),
         gravity=_gravity(gravity, latitude, altitude),
         sensitivity=sensitivity,
+        turntable=turntable,
         ros_distro=ros_distro,
     )
     outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))

@@ -54,6 +54,15 @@ class ImuSamples:
 
 
 @dataclass(frozen=True)
+class TableRates:
+    """One mounting on a turntable: its known rate over time, on the IMU's clock, linear between the rows."""
+
+    t_ns: Times  # (k,)
+    rate: Array  # (k,) rad/s about the table's axis
+    axis: Array | None = None  # (3,) that axis in the IMU's frame, where it is known
+
+
+@dataclass(frozen=True)
 class PoseSamples:
     """Poses T_parent_child over time."""
 

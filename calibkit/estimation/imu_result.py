@@ -66,11 +66,11 @@ def _residuals(name: str, found: ImuCalibration, start_ns: int) -> ResidualSet:
         sensor=name,
         unit="m/s²",
         t_ns=start_ns + np.round(middle * 1e9).astype(np.int64),
-        raw=np.array([[stand.misfit] for stand in stands]),
+        raw=np.array([stand.misfit for stand in stands], float).reshape(-1, 1),
         sigma=np.full(len(stands), max(found.misfit_rms, 1e-12)),
         context={
-            "kept": np.array([stand.dropped is None for stand in stands]),
-            "attitude": np.array([stand.up for stand in stands], float),
+            "kept": np.array([stand.dropped is None for stand in stands], bool),
+            "attitude": np.array([stand.up for stand in stands], float).reshape(-1, 3),
         },
     )
 

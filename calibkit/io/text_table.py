@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.folder import stamp_ns
-from calibkit.io.imu_options import ACCEL_UNITS, GYRO_UNITS
+from calibkit.io.imu_options import ACCEL_UNITS, COUNTS, GYRO_UNITS
 from calibkit.io.rows import Rows
 
 Array = NDArray[np.float64]
@@ -48,6 +48,11 @@ _NAMES = {
     "u": ("u",),
     "v": ("v",),
     "sigma_px": ("sigma_px", "sigma"),
+    "rate": ("rate", "table_rate"),
+    "run": ("run",),
+    "nx": ("nx", "axis_x"),
+    "ny": ("ny", "axis_y"),
+    "nz": ("nz", "axis_z"),
 }
 _CANONICAL = {name: key for key, names in _NAMES.items() for name in names}
 # Units as headers write them, lower case; of none SI is meant, and a time's is guessed from its size.
@@ -58,6 +63,7 @@ _UNITS: dict[str, Mapping[str, float]] = {
     **dict.fromkeys(GYRO, GYRO_UNITS),
     **dict.fromkeys(ACCEL, ACCEL_UNITS),
     **dict.fromkeys(XYZ, _LENGTH_UNITS),
+    "rate": {unit: scale for unit, scale in GYRO_UNITS.items() if unit not in COUNTS},
 }
 # Columns of files without a header: TUM poses, an IMU as EuRoC has it, the same without times, three axes with and without times.
 _SHAPES = {8: ["t", *XYZ, *Q], 7: ["t", *GYRO, *ACCEL], 6: [*GYRO, *ACCEL], 4: ["t", *XYZ], 3: [*XYZ]}

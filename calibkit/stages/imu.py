@@ -2,17 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibkit.data.observations import ImuSamples
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Imu
 from calibkit.errors import BadInputError, one_line
-from calibkit.estimation.imu_intrinsics import calibrate_imu
+from calibkit.estimation.imu_intrinsics import ImuCalibration, calibrate_imu
 from calibkit.estimation.imu_result import imu_result
+from calibkit.estimation.imu_table_fit import fit_table, table_alone, with_table
 from calibkit.estimation.imu_times import in_order, rate_hz
 from calibkit.io.imu_options import ImuOptions
+from calibkit.io.turntable_file import load_turntable
 from calibkit.models.imu import STANDARD_GRAVITY, Gravity
 from calibkit.stages.imu_source import open_imu
 from calibkit.stages.outputs import Outputs, Saved, save
@@ -28,6 +33,7 @@ class Options:
     reading: ImuOptions = _DEFAULT
     gravity: Gravity = STANDARD_GRAVITY
     sensitivity: bool = False  # of the gyroscope to acceleration, too
+    turntable: Path | None = None  # its known rates
     ros_distro: str | None = None
 
 
@@ -43,7 +49,7 @@ def imu(sources: Sequence[Path], outputs: Outputs | None = None, options: Option
     start_ns = int(samples.t_ns[0])
     t = np.asarray((samples.t_ns - start_ns) * 1e-9, np.float64)
     try:
-        found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, source.name)
+        found = _calibrate(t, samples, options, source.name)
     except BadInputError as error:
         raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {str(error).removeprefix(f'{source.name}: ')}") from None
     before = base.imus.get(source.name, Imu())
@@ -54,4 +60,18 @@ def imu(sources: Sequence[Path], outputs: Outputs | None = None, options: Option
         "gravity_from": options.gravity.source,
         "sensitivity": options.sensitivity,
     }
-    return save(result, base, outputs, source.recording.inputs(), told)
+    table = options.turntable
+    tables = [] if table is None else [(table.name, sha256(table.read_bytes()).hexdigest())]
+    return save(result, base, outputs, [*source.recording.inputs(), *tables], told)
+
+
+def _calibrate(t: NDArray[np.float64], samples: ImuSamples, options: Options, name: str) -> ImuCalibration:
+    """Return the calibration from stands, from a turntable's rates where they are given, or from both."""
+    table = None if options.turntable is None else fit_table(samples, load_turntable(options.turntable))
+    try:
+        found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, name)
+    except BadInputError:
+        if table is None:
+            raise
+        return table_alone(table, name)  # a recording of the table alone has no stands
+    return found if table is None else with_table(found, table, name)

@@ -7,7 +7,7 @@ import pytest
 from lens_samples import GRID, LENSES, T_CAM1_CAM0, board_views, rig_views, scrambled
 
 from calibkit.data.observations import BoardViews
-from calibkit.errors import NotConvergedError
+from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation import intrinsics, lens_fit
 from calibkit.estimation.camera_rig_seed import components, match_instants
 from calibkit.estimation.intrinsics import CameraRequest, calibrate_cameras
@@ -151,7 +151,7 @@ def test_views_with_few_corners_are_named():
 def test_a_camera_without_a_single_good_view_is_named():
     views = board_views("pinhole-radtan", 5, 0)
     rank = np.arange(len(views.frame)) - np.searchsorted(views.frame, views.frame)
-    with pytest.raises(NotConvergedError, match="cam0: no view has 6 corners"):
+    with pytest.raises(BadInputError, match="cam0: no view has 6 corners"):
         fit(only(views, rank < 5), "pinhole-radtan")
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.observations import BoardViews
-from calibkit.errors import NotConvergedError
+from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState, Residuals
 from calibkit.estimation.camera_rig_seed import Instants, board_poses, seed_rig
 from calibkit.estimation.lens_seed import robust_poses_of_views, seed_camera
@@ -73,7 +73,8 @@ def dense_views(views: BoardViews, model: str, instant: NDArray[np.int64]) -> Ca
 def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: Instants, robust: bool = True) -> LensFit:
     """Return the maximum-likelihood lenses, T_cam_cam0 and board poses of cameras that share instants.
 
-    Raises NotConvergedError naming the camera when there is no start or the solver ends nowhere.
+    Raises BadInputError naming the camera whose views have too few corners, NotConvergedError when there is no start or the solver ends
+    nowhere.
     """
     points = cameras[0].board.points
     dropped: list[DroppedView] = []
@@ -85,7 +86,7 @@ def fit_lenses(cameras: Sequence[BoardViews], models: Sequence[str], instants: I
         dropped += [DroppedView(views.camera, views.labels[i], f"fewer than {MIN_CORNERS} corners") for i in np.flatnonzero(~enough)]
         views = views.select(enough)
         if not views.n_frames:
-            raise NotConvergedError(f"{views.camera}: no view has {MIN_CORNERS} corners or more: check the target file against the board")
+            raise BadInputError(f"{views.camera}: no view has {MIN_CORNERS} corners or more: check the target file against the board")
         grid = dense_views(views, model, instant[enough])
         lens, seeds = seed_camera(grid, points)
         found = np.isfinite(seeds.error)

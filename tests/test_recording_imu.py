@@ -16,6 +16,7 @@ from calibkit.io import text_table
 from calibkit.io.bag_writer import ImuPayload, Sample, Stream, write_bag
 from calibkit.io.imu_options import G, ImuOptions
 from calibkit.io.recording import Recording, open_recording
+from calibkit.stages.info import info
 
 T0 = 1_700_000_000_000_000_000
 _UNTIMED = "gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]\n"
@@ -286,3 +287,14 @@ def test_the_real_recording_in_two_files_of_counts(data_dir: Path) -> None:
     assert imu.t_ns[:2].tolist() == [29_840_000, 39_857_000]
     np.testing.assert_array_equal([imu.accel[0], imu.gyro[0]], [[33108, 33329, 36429], [32786, 32429, 32499]])
     assert not any("different stamps" in w for w in recording.warnings)
+
+
+def test_info_of_a_file_without_times(tmp_path: Path) -> None:
+    path = tmp_path / "rest.csv"
+    rows = np.random.default_rng(0).normal(size=(500, 6)) * 1e-2 + np.array([0, 0, 0, 0, 0, 9.81])
+    np.savetxt(path, rows, "%.6f", ",", header="gx,gy,gz,ax,ay,az", comments="")
+    found = info([path], imu=ImuOptions(rate_hz=50.0))
+    assert found.duration_s == pytest.approx(9.98)
+    assert "allan, imu" in found.topics[0].topic.usable_for
+    with pytest.raises(BadInputError, match="--rate"):
+        info([path])

@@ -19,6 +19,9 @@ def run(
         list[Path], typer.Argument(metavar="SOURCE...", help="Bags, image folders, ASL folders or CSV files, on one clock.")
     ],
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Samples per second of an IMU's file without times.")] = None,
+    gyro_unit: Annotated[str | None, typer.Option("--gyro-unit", help="Unit of an IMU's file that does not say it.")] = None,
+    accel_unit: Annotated[str | None, typer.Option("--accel-unit", help="Unit of an IMU's file that does not say it.")] = None,
     ros_distro: Annotated[
         str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")
     ] = None,
@@ -28,10 +31,11 @@ def run(
     from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.errors import one_line
+    from calibkit.io.imu_options import ImuOptions
     from calibkit.stages.info import info
 
     refuse_clashes(sources, [json_file])
-    result = info(sources, ros_distro, json_file, force, bar)
+    result = info(sources, ros_distro, json_file, force, bar, ImuOptions(rate, gyro_unit, accel_unit))
     _show(result)
     if json_file is not None:
         typer.echo(f"json: {one_line(json_file)}")

@@ -16,7 +16,7 @@ Times = NDArray[np.int64]
 # What a topic of each kind is good for, as `calibkit info` tells it.
 USES = {
     "image": "intrinsics (with --target)",
-    "imu": "allan, joint, timeoffset (yet to come)",
+    "imu": "allan, imu; joint, timeoffset (yet to come)",
     "pose": "handeye, timeoffset (yet to come)",
     "tf": "handeye, timeoffset (yet to come)",
     "camera_info": "the driver's own calibration, to compare with",

@@ -13,9 +13,11 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.estimation import doctor
 from calibkit.estimation.doctor import Finding
 from calibkit.io.atomic import refuse_unwritable, write_json
+from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.source import Look, Stamps, TopicInfo
 
+_DEFAULT = ImuOptions()
 _SAMPLE = 20  # images of a topic that are decoded and judged
 _TIMED = ("image", "imu", "pose", "camera_info", "corners", "cloud")  # kinds whose times matter
 
@@ -57,7 +59,7 @@ class Info:
     @property
     def duration_s(self) -> float:
         """From the first to the last stamp of topics that have stamps."""
-        spans = [(t.start_ns, t.end_ns) for t in self.topics if t.start_ns and t.end_ns]
+        spans = [(t.start_ns, t.end_ns) for t in self.topics if t.start_ns is not None and t.end_ns]
         return (max(end for _, end in spans) - min(start for start, _ in spans)) * 1e-9 if spans else 0.0
 
     @property
@@ -67,18 +69,23 @@ class Info:
 
 
 def info(
-    sources: list[Path], ros_distro: str | None = None, json_path: Path | None = None, force: bool = False, progress: Progress = silent
+    sources: list[Path],
+    ros_distro: str | None = None,
+    json_path: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+    imu: ImuOptions = _DEFAULT,
 ) -> Info:
     """Look through a recording and write what was found as JSON where asked; BadInputError where nothing can be read."""
     if json_path is not None:
         refuse_unwritable(json_path, force)
-    recording = open_recording(sources, ros_distro)
+    recording = open_recording(sources, ros_distro, imu)
     judges = {topic.name: _ImageJudge() for topic in recording.topics if topic.kind == "image"}
     looks = {topic.name: Look(max(1, topic.count // _SAMPLE), judges[topic.name].see) for topic in recording.topics if topic.name in judges}
     survey = recording.survey(progress, looks)
     topics = [_examine(topic, survey[topic.name], judges.get(topic.name)) for topic in recording.topics]
     names = tuple(dict.fromkeys(one_line(path.name or path.resolve().name, 120) for path in sources))
-    spans = {t.topic.name: (t.start_ns, t.end_ns) for t in topics if t.topic.kind in _TIMED and t.start_ns and t.end_ns}
+    spans = {t.topic.name: (t.start_ns, t.end_ns) for t in topics if t.topic.kind in _TIMED and t.start_ns is not None and t.end_ns}
     findings = (*doctor.check_clocks(_latencies(recording, survey)), *doctor.check_overlap(spans))
     result = Info(names, tuple(topics), findings, tuple(recording.warnings))
     if json_path is not None:

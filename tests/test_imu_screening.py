@@ -164,6 +164,19 @@ def test_a_long_gap_splits_and_a_short_one_is_told(still: ImuSamples) -> None:
     assert rate_hz(gapped.t_ns) == pytest.approx(RATE, rel=1e-9)
 
 
+def test_stamps_in_bursts_do_not_make_the_rate(still: ImuSamples) -> None:
+    burst = np.arange(N) // 10 * 10
+    bunched = replace(still, t_ns=still.t_ns[burst] + (np.arange(N) - burst) * 100_000)  # ten samples within a millisecond
+    assert rate_hz(bunched.t_ns) == pytest.approx(RATE, rel=1e-4)
+    assert "the mean rate, 100 Hz" in _only(bunched, "bursts").text
+
+
+def test_many_missing_samples_are_more_than_told(still: ImuSamples) -> None:
+    lossy = still.select(np.random.default_rng(0).random(N) > 0.3)
+    assert rate_hz(lossy.t_ns) == pytest.approx(RATE)
+    assert "K some 19" in _only(lossy, "missing").text  # 1 / sqrt(1 - 0.3)
+
+
 def test_jitter_is_told(still: ImuSamples) -> None:
     late = np.random.default_rng(1).integers(0, 4_000_000, N)
     assert "stamps jitter: intervals scatter by" in _only(replace(still, t_ns=still.t_ns + late), "jitter").text

@@ -14,6 +14,8 @@ _LEAST = 100  # samples; fewer are no recording to judge
 _GAP = 1.75  # typical intervals; above, a sample or more is missing
 _SPLIT_S, _SPLIT = 1.0, 1e-3  # a gap above both, the second a share of the duration, splits the recording
 _JITTER = 0.1  # robust sigma of the interval over its median
+_BURSTS = 2.0  # mean interval between long gaps over the typical one, above which the stamps are no sampling times
+_MISSING = 0.01  # share of the samples, above which joining what lies around them changes the noise
 _SHORT_S = 600.0  # below, flicker and walks are out of sight
 _MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 
@@ -30,10 +32,20 @@ def in_order(samples: ImuSamples) -> ImuSamples:
 
 def rate_hz(t_ns: Times) -> float:
     """Return the samples per second between gaps, from stamps in order."""
-    steps = np.diff(t_ns)
-    typical = np.median(steps[steps > 0])
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    typical, bursts = _interval(t_s)
+    steps = np.diff(t_s)
     kept = steps[steps <= _GAP * typical]  # repeated stamps count: their samples were taken, too
-    return float(1e9 / np.mean(kept)) if np.mean(kept) > 0 else float(1e9 / typical)
+    return float(1 / typical) if bursts or not np.mean(kept) > 0 else float(1 / np.mean(kept))
+
+
+def _interval(t_s: NDArray[np.float64]) -> tuple[float, bool]:
+    """Return the typical interval in s, and whether it is the mean one: of stamps in bursts the typical one says nothing of the sampling."""
+    steps = np.diff(t_s)
+    typical = float(np.median(steps[steps > 0]))
+    between = steps[steps <= max(_SPLIT_S, _SPLIT * t_s[-1])]
+    mean = float(np.mean(between)) if len(between) else typical
+    return (mean, True) if mean > _BURSTS * typical else (typical, False)
 
 
 def repeated(samples: ImuSamples) -> Mask:
@@ -83,7 +95,7 @@ def _duplicates(ordered: ImuSamples, t_s: NDArray[np.float64]) -> list[Finding]:
 def _gaps(t_s: NDArray[np.float64]) -> list[Finding]:
     """A gap of G s in T s adds 3 G / T to a random walk's variance, less to other noise: short ones are kept."""
     steps = np.diff(t_s)
-    typical = float(np.median(steps[steps > 0]))
+    typical, _ = _interval(t_s)
     spread = _MAD * float(np.median(np.abs(steps - typical)))
     missing = np.flatnonzero(steps > max(_GAP * typical, typical + 8 * spread))
     split = steps[missing] > max(_SPLIT_S, _SPLIT * t_s[-1])
@@ -92,15 +104,22 @@ def _gaps(t_s: NDArray[np.float64]) -> list[Finding]:
         text = f"a gap of {steps[i]:.3g} s, about {round(steps[i] / typical) - 1} samples missing"
         found.append(Finding("gap", text, float(t_s[i]), float(t_s[i + 1]), cut=True))
     if len(small := missing[~split]):
-        lost = counted(int(np.sum(np.rint(steps[small] / typical) - 1)), "sample")
+        lost = int(np.sum(np.rint(steps[small] / typical) - 1))
+        share = lost / (len(t_s) + lost)
         gaps = counted(len(small), "short gap", "short gaps")
-        text = f"{gaps} of up to {steps[small].max():.3g} s, about {lost} missing: what lies around is joined"
-        found.append(Finding("short_gap", text, *_span(t_s[small])))
+        text = f"{gaps} of up to {steps[small].max():.3g} s, about {counted(lost, 'sample')} missing: what lies around is joined"
+        if share > _MISSING:  # the time of the whole is shorter by that share, so a walk seems faster
+            text += f", which makes K some {1 / np.sqrt(1 - share) - 1:.1%} too large: record without losses"
+        found.append(Finding("missing" if share > _MISSING else "short_gap", text, *_span(t_s[small])))
     return found
 
 
 def _jitter(t_s: NDArray[np.float64]) -> list[Finding]:
     steps = np.diff(t_s)
+    mean, bursts = _interval(t_s)
+    if bursts:
+        text = f"stamps come in bursts, or most samples are missing: the mean rate, {1 / mean:.4g} Hz, is taken for that of sampling"
+        return [Finding("bursts", text, 0.0, float(t_s[-1]))]
     typical = float(np.median(steps))
     spread = _MAD * float(np.median(np.abs(steps - typical)))
     if spread < _JITTER * typical:

@@ -273,6 +273,14 @@ def test_too_little_is_refused(usual: MultiPosition) -> None:
         calibrate_imu(usual.t, usual.gyro * np.nan, usual.accel, 9.81)
 
 
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_a_dead_axis_is_refused(usual: MultiPosition, sensor: str) -> None:
+    samples = {"gyro": usual.gyro.copy(), "accel": usual.accel.copy()}
+    samples[sensor][:, 2] = 0.0  # its scale would be 0 with any sigma, and the others' scales judged by a mean with it
+    with pytest.raises(BadInputError, match="z never changes"):
+        calibrate_imu(usual.t, samples["gyro"], samples["accel"], 9.81)
+
+
 def test_jacobian_of_all_rows(usual: MultiPosition) -> None:
     samples = Samples(usual.t, usual.gyro, usual.accel, 9.81)
     stands = find_stands(usual.t, usual.gyro, usual.accel, 9.81)

@@ -67,6 +67,10 @@ def calibrate_imu(t: Array, gyro: Array, accel: Array, gravity: float, sensitivi
 def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool, name: str) -> ImuCalibration:
     if not (np.isfinite(t).all() and np.isfinite(gyro).all() and np.isfinite(accel).all()):
         raise BadInputError("holds values that are not finite: remove those samples from the recording")
+    for sensor, values in (("gyroscope", gyro), ("accelerometer", accel)):
+        for axis, stuck in zip("xyz", np.ptp(values, axis=0) == 0 if len(values) else (), strict=False):
+            if stuck:
+                raise BadInputError(f"{sensor} {axis} never changes: the axis is dead, or the driver does not fill it")
     later = np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]])[: len(t)]
     if np.count_nonzero(later) < _FEWEST_SAMPLES:
         found = counted(int(np.count_nonzero(later)), "sample")

@@ -197,3 +197,18 @@ def test_degrees_taken_for_radians_and_g_for_metres_are_told(run: Run, tmp_path:
     said = run("allan", write(tmp_path / "wrong.csv", wrong))
     assert "CHECK imu0: " in said.out
     assert "--accel-unit g" in said.out
+
+
+def test_a_dead_sensor_is_told_and_drawn_without(run: Run, tmp_path: Path) -> None:
+    samples = rest(60)
+    samples[:, :3] = 0
+    report = tmp_path / "report"
+    said = run("allan", write(tmp_path / "imu.csv", samples), "--report", report)
+    assert said.code == 3, said
+    assert "gyroscope x never changes" in said.out
+    assert (report / "imu0-allan-allan.png").exists()
+
+
+@pytest.mark.parametrize("name", ["\u00fc0", "a" * 41, "0imu", ""])
+def test_a_name_that_the_rig_file_would_refuse_is_refused(run: Run, recording: Path, name: str) -> None:
+    assert "write imu0=/topic" in run("allan", recording, "--imu", f"{name}=").mistake

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,11 @@ def _view(result: Result, residuals: ResidualSet) -> View:
     camera = result.rig.cameras.get(residuals.sensor)
     context = residuals.context
     good = np.all(np.abs(residuals.raw) < _ABSURD, axis=1)  # NaN is not
+    if "axis" in context:
+        good &= (context["axis"] >= 0) & (context["axis"] < len(get_args(ImuAxis)))
+    for key in ("tau", "deviation", "fitted", "low", "high"):  # drawn in logarithms
+        if key in context:
+            good &= np.isfinite(context[key]) & (context[key] > 0)
     if "uv" in context:
         good &= np.all(np.isfinite(context["uv"].astype(float)), axis=1)
 

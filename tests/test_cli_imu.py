@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +137,19 @@ def test_gravity_that_is_not_given_is_in_the_scales_sigma(run: Run, recording: P
     assert "give one of them" in run("imu", recording, "--gravity", G, "--latitude", 47).mistake
     assert "--altitude needs --latitude" in run("imu", recording, "--altitude", 400).mistake
     assert "is no gravity" in run("imu", recording, "--gravity", "nan").mistake
+
+
+@pytest.mark.parametrize(
+    ("sensor", "scale", "option", "unit"), [("accel", 1 / 9.80665, "--accel-unit", "g"), ("gyro", 180 / np.pi, "--gyro-unit", "deg/s")]
+)
+def test_a_unit_that_is_not_stated_is_told(
+    run: Run, made: MultiPosition, tmp_path: Path, sensor: str, scale: float, option: str, unit: str
+) -> None:
+    path = write(tmp_path / "imu.csv", replace(made, **{sensor: getattr(made, sensor) * scale}))
+    said = run("imu", path, "--gravity", G)
+    assert "CHECK" in said.out
+    assert f"is it in {unit}? then add {option} {unit}" in said.out
+    assert "CHECK" not in run("imu", path, "--gravity", G, option, unit).out
 
 
 def test_too_few_attitudes_are_said_and_what_to_add(run: Run, tmp_path: Path) -> None:

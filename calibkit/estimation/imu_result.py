@@ -7,11 +7,17 @@ from calibkit.data.observations import ImuUnit
 from calibkit.data.plural import counted
 from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Covariance, Estimate, Imu, ImuIntrinsics, Rig
-from calibkit.data.verdict import Status
+from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.estimation.imu_intrinsics import ImuCalibration
-from calibkit.models.imu import CORRECTION, EQUATION, UNITS, Gravity
+from calibkit.models.imu import CORRECTION, EQUATION, STANDARD_GRAVITY, UNITS, Gravity
 
 Array = NDArray[np.float64]
+
+_ODD = 1.25  # a scale farther from 1 is no sensor's error
+_UNITS_LIKELY = (  # sensor, its scales, its option, and what each likely unit is worth in SI
+    ("accelerometer", "M_a", "accel-unit", {"g": STANDARD_GRAVITY.value, "mg": STANDARD_GRAVITY.value / 1000}),
+    ("gyroscope", "M_g", "gyro-unit", {"deg/s": np.pi / 180, "mdeg/s": np.pi / 180e3, "mrad/s": 1e-3}),
+)
 
 
 def imu_result(
@@ -19,6 +25,7 @@ def imu_result(
 ) -> Result:
     """Return the result of stage `imu`; `before` is what a rig file already says of this IMU."""
     cov = _with_gravity(found, gravity)
+    reasons = (*found.reasons, *(_about_units(name, found) if unit == "SI" else ()))
     sigma = dict(zip(found.names, np.sqrt(np.diag(cov)).tolist(), strict=True))
     parameters = {
         key: Estimate(
@@ -33,14 +40,14 @@ def imu_result(
         gravity=gravity.value,
         parameters=parameters,
         covariance=Covariance(order=list(found.names), matrix=cov.tolist()) if found.names else None,
-        verdict=found.verdict,
-        reasons=[reason.text.removeprefix(f"{name}: ") for reason in found.reasons],
+        verdict=worst(reasons),
+        reasons=[reason.text.removeprefix(f"{name}: ") for reason in reasons],
     )
     imu = before.model_copy(update={"topic": topic, "rate_hz": rate_hz, "intrinsics": intrinsics})
     return Result(
         stage="imu",
         rig=Rig(imus={name: imu}),
-        reasons=found.reasons,
+        reasons=reasons,
         residuals=(_residuals(name, found, start_ns),),
         facts={
             "lines": _lines(name, topic, found, rate_hz, gravity),
@@ -50,6 +57,20 @@ def imu_result(
         },
         not_observable=tuple(f"{name}.{key}" for key, number in found.parameters.items() if number.status is Status.NOT_OBSERVABLE),
     )
+
+
+def _about_units(name: str, found: ImuCalibration) -> list[Reason]:
+    """Return a reason for each sensor whose scale is far from 1, as only another unit makes it."""
+    out = []
+    for sensor, key, option, units in _UNITS_LIKELY:
+        known = [value for axis in "xyz" if (value := found.parameters[f"{key}_{axis}{axis}"].value) is not None]
+        scale = float(np.median(np.abs(known))) if known else 1.0
+        if 1 / _ODD < scale < _ODD:
+            continue
+        guess = next((unit for unit, worth in units.items() if 1 / _ODD < scale * worth < _ODD), None)
+        what = "another unit, or raw counts?" if guess is None else f"is it in {guess}? then add --{option} {guess}"
+        out.append(Reason(Verdict.CHECK, f"{name}: the {sensor}'s scale is {scale:.4g}, not about 1: {what}"))
+    return out
 
 
 def _with_gravity(found: ImuCalibration, gravity: Gravity) -> Array:

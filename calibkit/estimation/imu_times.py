@@ -40,7 +40,7 @@ def rate_hz(t_ns: Times) -> float:
 
 
 def _interval(t_s: NDArray[np.float64]) -> tuple[float, bool]:
-    """Return the typical interval in s, and whether it is the mean one: of stamps in bursts the typical one says nothing of the sampling."""
+    """Return the typical interval in s, and whether it is the mean one: of stamps in bursts the typical one says nothing."""
     steps = np.diff(t_s)
     typical = float(np.median(steps[steps > 0]))
     between = steps[steps <= max(_SPLIT_S, _SPLIT * t_s[-1])]

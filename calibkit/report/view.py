@@ -87,10 +87,11 @@ def _view(result: Result, residuals: ResidualSet) -> View:
     context = residuals.context
     good = np.all(np.abs(residuals.raw) < _ABSURD, axis=1)  # NaN is not
     if "axis" in context:
-        good &= (context["axis"] >= 0) & (context["axis"] < len(get_args(ImuAxis)))
+        good &= np.isin(context["axis"], np.arange(len(get_args(ImuAxis))))
     for key in ("tau", "deviation", "fitted", "low", "high"):  # drawn in logarithms
         if key in context:
-            good &= np.isfinite(context[key]) & (context[key] > 0)
+            value = context[key].astype(float)
+            good &= np.isfinite(value) & (value > 0)
     if "uv" in context:
         good &= np.all(np.isfinite(context["uv"].astype(float)), axis=1)
 

@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibkit.data.observations import ImuSamples, TableRates
 from calibkit.data.verdict import Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.estimation import imu_fit
 from calibkit.estimation.imu_fit import Samples
 from calibkit.estimation.imu_intrinsics import ImuCalibration, calibrate_imu
+from calibkit.estimation.imu_table_fit import fit_table
 from calibkit.estimation.imu_turns import Turns, integrate
-from calibkit.estimation.imu_turntable import TurntableRun, turntable_gyro
+from calibkit.estimation.imu_turntable import TurntableGyro, TurntableRun, turntable_gyro
 from calibkit.estimation.imu_weights import find_weights
 from calibkit.estimation.static_intervals import find_stands
 from calibkit.geometry import so3
@@ -342,6 +344,25 @@ def test_a_turntable_tells_the_scale(known: bool) -> None:
         np.testing.assert_allclose(found.M_g, model.M_g, atol=2)
         assert (found.C_g_i is not None) == known
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.35
+
+
+def test_a_turntable_that_hardly_turns_tells_no_scale() -> None:
+    rng, begins = np.random.default_rng(0), np.array([0.0, 30.0, 60.0])
+    t = np.arange(0, 90, 0.01)
+
+    def told(rate: float, seconds: float) -> TurntableGyro:
+        turned, rates = 0.1 * rng.standard_normal((len(t), 3)), []
+        for begin, n in zip(begins, np.eye(3), strict=True):
+            at, values = begin + seconds * np.array([0, 0.5, 1]), rate * np.array([0.0, 1, -1])
+            turned += np.interp(t, at, values, 0, 0)[:, None] * n
+            rates.append(TableRates((at * 1e9).astype(np.int64), values, n))
+        return fit_table(ImuSamples((t * 1e9).astype(np.int64), turned, np.zeros_like(turned)), rates)
+
+    assert np.sqrt(np.diag(told(1.0, 20.0).cov)).max() < 0.03
+    with pytest.raises(BadInputError, match="too slow"):
+        told(0.01, 20.0)
+    with pytest.raises(BadInputError, match="let each last 10 s"):  # one block of residuals: its scatter is 0
+        told(1.0, 0.9)
 
 
 def test_a_turntable_that_does_not_tell() -> None:

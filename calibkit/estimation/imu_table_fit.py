@@ -14,6 +14,7 @@ from calibkit.estimation.imu_intrinsics import ImuCalibration
 from calibkit.estimation.imu_trust import Number
 from calibkit.estimation.imu_turntable import TurntableGyro, TurntableRun, turntable_gyro
 from calibkit.models.imu import ACCEL_PARAMETERS, GYRO_PARAMETERS, ImuModel
+from calibkit.solver import trust
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,20 @@ def fit_table(samples: ImuSamples, rates: Sequence[TableRates]) -> TurntableGyro
         origin = run.t_ns[0]
         t, t_rate = ((ns - origin) * 1e-9 for ns in (samples.t_ns[inside], run.t_ns))
         runs.append(TurntableRun(np.asarray(t, np.float64), samples.gyro[inside], np.asarray(t_rate, np.float64), run.rate, run.axis))
-    return turntable_gyro(runs)
+    table = turntable_gyro(runs)
+    if _relative(np.sqrt(np.diag(table.cov)).max(), table) > trust.WEAK * trust.SCALES[""]:
+        raise BadInputError("turntable: its rates are too slow or its runs too short to tell the gyroscope's scale; turn it faster")
+    return table
+
+
+def _relative(sigma: float, table: TurntableGyro) -> float:
+    """Return a sigma over the gyroscope's scale."""
+    return float(sigma) / (float(np.trace(table.M_g)) / 3)
+
+
+def _status(sigma: float, table: TurntableGyro) -> Status:
+    """Return how well a number is known: 1e-3 of scale, or 1e-3 rad/s of bias; what is not observable was refused before."""
+    return Status.DETERMINED if _relative(sigma, table) <= trust.DETERMINED * trust.SCALES[""] else Status.WEAK
 
 
 def table_alone(table: TurntableGyro, name: str) -> ImuCalibration:
@@ -43,9 +57,9 @@ def table_alone(table: TurntableGyro, name: str) -> ImuCalibration:
     unknown = Number(None, None, None, Status.NOT_OBSERVABLE)
     parameters = dict.fromkeys((*ACCEL_PARAMETERS, *GYRO_PARAMETERS), unknown)
     for key, value, s in zip(_M_G, table.M_g[_LOWER], np.sqrt(np.diag(table.cov)), strict=True):
-        parameters[key] = Number(float(value), float(s), None, Status.DETERMINED)
+        parameters[key] = Number(float(value), float(s), None, _status(float(s), table))
     for key, value, s in zip(_B_G, bias.mean(axis=0), sigma, strict=True):
-        parameters[key] = Number(float(value), float(s), None, Status.DETERMINED) if np.isfinite(s) else unknown
+        parameters[key] = Number(float(value), float(s), None, _status(float(s), table)) if np.isfinite(s) else unknown
     cov = np.zeros((9, 9))
     cov[:6, :6], cov[6:, 6:] = table.cov, np.diag(sigma**2) if np.isfinite(sigma).all() else 0
     names = (*_M_G, *_B_G) if np.isfinite(sigma).all() else _M_G
@@ -82,7 +96,7 @@ def with_table(found: ImuCalibration, table: TurntableGyro, name: str) -> ImuCal
     parameters = dict(found.parameters)
     for key, s in zip(names, sigma, strict=True):
         before = found.parameters[key]
-        status = Status.DETERMINED if key in _M_G else before.status
+        status = _status(float(s), table) if key in _M_G else before.status
         parameters[key] = Number(values[key], float(s), None if key in _M_G else before.sigma_plain, status)
     complete = {key: number.value for key, number in parameters.items() if number.value is not None}
     model = ImuModel.of(complete) if len(complete) == len(parameters) else None

@@ -12,6 +12,7 @@ from calibkit.models.imu import lower
 Array = NDArray[np.float64]
 
 _BLOCK_S = 1.0  # residuals farther apart are taken for independent
+_LEAST_S = 10.0  # of a run: a sigma from fewer blocks is too small, from one it is 0
 _STEP = 1e-6
 _RANK = 1e-3  # smallest singular value over the largest, of what the axes span
 _ROWS, _COLUMNS = np.tril_indices(3)
@@ -51,8 +52,10 @@ def response(run: TurntableRun) -> Response:
     """Return the response to the known rate, by least squares; its covariance from blocks of a second."""
     inside = (run.t >= run.t_rate[0]) & (run.t <= run.t_rate[-1])
     t, gyro = run.t[inside], run.gyro[inside]
+    if len(t) < 10 or t[-1] - t[0] < 0.95 * _LEAST_S:
+        raise BadInputError(f"turntable: a run lasts {np.ptp(t) if len(t) else 0:.2g} s; let each last {_LEAST_S:.0f} s or more")
     rate = np.interp(t, run.t_rate, run.rate)
-    if len(t) < 10 or np.ptp(rate) == 0:
+    if np.ptp(rate) == 0:
         raise BadInputError("turntable: its rate never changes, so scale and bias cannot be told apart; use two rates or more")
     J = np.column_stack([rate, np.ones(len(t))])
     inverse = np.linalg.inv(J.T @ J)

@@ -212,3 +212,16 @@ def test_a_dead_sensor_is_told_and_drawn_without(run: Run, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", ["\u00fc0", "a" * 41, "0imu", ""])
 def test_a_name_that_the_rig_file_would_refuse_is_refused(run: Run, recording: Path, name: str) -> None:
     assert "write imu0=/topic" in run("allan", recording, "--imu", f"{name}=").mistake
+
+
+def test_two_files_of_different_rates_are_taken_one_by_one(run: Run, tmp_path: Path) -> None:
+    samples = rest(400)
+    t = np.arange(len(samples)) / RATE
+    np.savetxt(tmp_path / "gyro.csv", np.column_stack([t, samples[:, :3]]), "%.9f", ",", header="t [s],gx,gy,gz", comments="")
+    np.savetxt(tmp_path / "acc.csv", np.column_stack([t, samples[:, 3:]])[::4], "%.9f", ",", header="t [s],ax,ay,az", comments="")
+    assert "give one file" in run("allan", tmp_path / "gyro.csv", tmp_path / "acc.csv").mistake  # every 4th rate would have twice the N
+    run("allan", tmp_path / "gyro.csv", "-o", tmp_path / "one.yaml")
+    run("allan", tmp_path / "acc.csv", "--rig", tmp_path / "one.yaml", "-o", tmp_path / "both.yaml")
+    noise = load_rig(tmp_path / "both.yaml").imus["imu0"].noise
+    assert noise["gyro_x"].white.value == pytest.approx(GYRO.white, rel=0.05)
+    assert noise["accel_x"].white.value is not None

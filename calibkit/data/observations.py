@@ -34,6 +34,7 @@ class ImuSamples:
     gyro: Array  # (n, 3) rad/s, or counts; (n, 0) where there is no gyroscope
     accel: Array  # (n, 3) m/s^2, or counts; (n, 0) where there is no accelerometer
     unit: ImuUnit = "SI"
+    interpolated: bool = False  # the gyroscope at the accelerometer's times: its noise is another
 
     def __post_init__(self) -> None:
         n = len(self.t_ns)
@@ -50,7 +51,7 @@ class ImuSamples:
 
     def select(self, rows: slice | NDArray[np.generic]) -> "ImuSamples":
         """Return some of the samples: a slice (views of the arrays), a mask or indices."""
-        return ImuSamples(self.t_ns[rows], self.gyro[rows], self.accel[rows], self.unit)
+        return ImuSamples(self.t_ns[rows], self.gyro[rows], self.accel[rows], self.unit, self.interpolated)
 
 
 @dataclass(frozen=True)

@@ -145,4 +145,4 @@ def _joined(source: Source, accel: ImuSamples, gyro: ImuSamples) -> ImuSamples:
         f"{source.name} have different stamps: the gyroscope is interpolated at the accelerometer's, "
         f"over the {(t_ns.max() - t_ns.min()) * 1e-9:.6g} s that they share"
     )
-    return ImuSamples(t_ns, turned, accel.accel[inside], accel.unit)
+    return ImuSamples(t_ns, turned, accel.accel[inside], accel.unit, interpolated=True)

@@ -145,7 +145,7 @@ def _join_imu(parts: list[ImuSamples], topic: str) -> ImuSamples:
     if len({(part.unit, part.has_gyro, part.has_accel) for part in parts}) > 1:
         raise BadInputError(f"{topic} holds other sensors or units in one file than in another: give one of them")
     t_ns, gyro, accel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "gyro", "accel"))
-    return ImuSamples(t_ns, gyro, accel, parts[0].unit)
+    return ImuSamples(t_ns, gyro, accel, parts[0].unit, any(part.interpolated for part in parts))
 
 
 def _join_stamps(parts: list[Stamps], topic: str) -> Stamps:

@@ -53,6 +53,11 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     if options.table is not None:
         refuse_unwritable(options.table, outputs.force)
     source = open_imu(sources, options.imu, options.reading, options.ros_distro, progress, counts=False, partial=True)
+    if source.samples.interpolated:
+        raise BadInputError(
+            f"{source.recording.name}: its two files have different stamps, and a gyroscope that is interpolated has another noise: "
+            "give one file, then the other with --rig OUT.yaml"
+        )
     try:
         findings = screen(source.samples)
         moving = next((finding for finding in findings if finding.kind == "moving"), None)

@@ -225,3 +225,18 @@ def test_two_files_of_different_rates_are_taken_one_by_one(run: Run, tmp_path: P
     noise = load_rig(tmp_path / "both.yaml").imus["imu0"].noise
     assert noise["gyro_x"].white.value == pytest.approx(GYRO.white, rel=0.05)
     assert noise["accel_x"].white.value is not None
+
+
+@pytest.mark.parametrize("fault", ["twice", "clock"])
+def test_neither_repeated_samples_nor_a_clock_that_is_set_back_change_the_rate(run: Run, tmp_path: Path, fault: str) -> None:
+    lines = write(tmp_path / "imu.csv", rest(400)).read_text().splitlines()
+    if fault == "twice":
+        lines = [lines[0], *(line for line in lines[1:] for _ in range(2))]
+    else:
+        late = write(tmp_path / "late.csv", rest(400), start_ns=1_699_999_500 * 10**9).read_text().splitlines()
+        lines += late[1:]
+    (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
+    run("allan", tmp_path / "imu.csv", "-o", tmp_path / "rig.yaml")
+    imu = load_rig(tmp_path / "rig.yaml").imus["imu0"]
+    assert imu.rate_hz == pytest.approx(RATE)
+    assert imu.noise["gyro_x"].white.value == pytest.approx(GYRO.white, rel=0.05)

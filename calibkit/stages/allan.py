@@ -64,13 +64,14 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
         if moving is not None:
             raise BadInputError(moving.text)
         pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
+        rate = rate_hz(np.concatenate([piece.t_ns for piece in pieces]))  # in order, each sample once
+        fitted = _fit(pieces, rate, progress)
     except BadInputError as error:
         raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {error}") from None
     axes = [
         axis for sensor, has in (("gyro", source.samples.has_gyro), ("accel", source.samples.has_accel)) if has for axis in AXES[sensor]
     ]
-    rate = rate_hz(source.samples.t_ns)
-    noise = dict(zip(axes, _fit(pieces, rate, progress), strict=True))
+    noise = dict(zip(axes, fitted, strict=True))
     longest = max(pieces, key=lambda piece: len(piece.t_ns))
     curve = _deviation(longest, rate, "overlapping", options.exact)
     hours = [_hours(piece, rate) for piece in pieces]

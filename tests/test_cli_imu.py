@@ -129,6 +129,8 @@ def test_gravity_that_is_not_given_is_in_the_scales_sigma(run: Run, recording: P
         run("imu", recording, *options, "-o", tmp_path / f"{name}.yaml")
         sigmas[name] = intrinsics(tmp_path / f"{name}.yaml").parameters["M_a_xx"].sigma
     assert sigmas["given"] < sigmas["place"] < sigmas["none"]
+    plain = intrinsics(tmp_path / "none.yaml").parameters["M_a_xx"].sigma_plain
+    assert sigmas["none"] == pytest.approx(plain, rel=0.02)  # or the factor between them would speak of residuals, and be gravity's
     assert sigmas["none"] == pytest.approx(1.01 * STANDARD_GRAVITY.sigma / STANDARD_GRAVITY.value, rel=0.1)
     # Zurich's gravity is 9.8067 (Swiss gravity net 9.80648); the equator's and the pole's normal gravity are WGS 84's own
     assert gravity_at(47.4, 400).value == pytest.approx(9.8067, abs=1e-3)

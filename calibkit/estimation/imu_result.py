@@ -24,12 +24,18 @@ def imu_result(
     name: str, topic: str, found: ImuCalibration, unit: ImuUnit, gravity: Gravity, rate_hz: float, start_ns: int, before: Imu
 ) -> Result:
     """Return the result of stage `imu`; `before` is what a rig file already says of this IMU."""
-    cov = _with_gravity(found, gravity)
+    of_gravity = _by_gravity(found, gravity)
+    cov = found.cov + np.outer(of_gravity, of_gravity)
+    shared = dict(zip(found.names, of_gravity.tolist(), strict=True))
     reasons = (*found.reasons, *(_about_units(name, found) if unit == "SI" else ()))
     sigma = dict(zip(found.names, np.sqrt(np.diag(cov)).tolist(), strict=True))
     parameters = {
         key: Estimate(
-            value=number.value, unit=UNITS[unit][key[:3]], sigma=sigma.get(key), sigma_plain=number.sigma_plain, status=number.status
+            value=number.value,
+            unit=UNITS[unit][key[:3]],
+            sigma=sigma.get(key),
+            sigma_plain=_plain(number.sigma_plain, shared.get(key, 0.0)),
+            status=number.status,
         )
         for key, number in found.parameters.items()
     }
@@ -73,10 +79,15 @@ def _about_units(name: str, found: ImuCalibration) -> list[Reason]:
     return out
 
 
-def _with_gravity(found: ImuCalibration, gravity: Gravity) -> Array:
-    """Return the covariance with what is not known of gravity: M_a goes as 1 / g, all of it together."""
+def _plain(sigma: float | None, of_gravity: float) -> float | None:
+    """Return sigma as if residuals were white, gravity's share in it as in the corrected one: no residual tells of gravity."""
+    return None if sigma is None else float(np.hypot(sigma, of_gravity))
+
+
+def _by_gravity(found: ImuCalibration, gravity: Gravity) -> Array:
+    """Return the sigma of each parameter, signed, by what is not known of gravity: M_a goes as 1 / g, all of it together."""
     slope = np.array([(found.parameters[key].value or 0.0) / gravity.value if key.startswith("M_a") else 0.0 for key in found.names])
-    out: Array = found.cov + gravity.sigma**2 * np.outer(slope, slope)
+    out: Array = gravity.sigma * slope
     return out
 
 

@@ -86,6 +86,14 @@ def _moving() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return t, wave + 0.002 * rng.standard_normal(wave.shape), 9.81 * wave + 0.02 * rng.standard_normal(wave.shape)
 
 
+def test_a_resting_recording_is_not_called_moving() -> None:
+    rng, t = np.random.default_rng(0), np.arange(0, 600, 0.05)
+    bias = 0.0004 * np.cumsum(rng.standard_normal((len(t), 3)), axis=0) / np.sqrt(len(t))
+    gyro, accel = bias + 2e-5 * rng.standard_normal((len(t), 3)), [0, 0, 9.81] + 0.02 * rng.standard_normal((len(t), 3))
+    with pytest.raises(BadInputError, match=r"or never moved.*calibkit allan"):
+        find_stands(t, gyro, accel, 9.81)
+
+
 def test_a_moving_recording_is_told() -> None:
     with pytest.raises(BadInputError, match="never stood still"):
         find_stands(*_moving(), 9.81)

@@ -74,7 +74,10 @@ def find_stands(t: Array, gyro: Array, accel: Array, gravity: float) -> Stands:
     wandering = np.sqrt(np.mean(np.sum((stands.gyro - np.median(stands.gyro, axis=0)) ** 2, axis=1)))
     overall = np.sqrt(np.mean(np.sum((gyro - np.median(stands.gyro, axis=0)) ** 2, axis=1)))
     if len(stands) > 1 and wandering > _TURNS_STILL * overall:
-        raise BadInputError("the IMU never stood still: it turns even in the quietest parts; put it down, still, in 12 or more attitudes")
+        raise BadInputError(
+            "the IMU never stood still, or never moved: its quietest parts turn about as much as the others; "
+            "put it down, still, in 12 or more attitudes (calibkit allan is for a recording at rest)"
+        )
     return stands
 
 

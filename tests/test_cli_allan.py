@@ -105,7 +105,7 @@ def test_rest_in_noise_out(run: Run, recording: Path, tmp_path: Path) -> None:
     assert data["facts"]["allan"]["axes"]["gyro_x"]["walk"]["upper95"] > 0
     with (tmp_path / "curve.csv").open() as stream:
         table = list(csv.reader(stream))
-    assert table[0][:4] == ["tau [s]", "gyro_x deviation", "gyro_x low", "gyro_x high"]
+    assert table[0][:4] == ["tau [s]", "gyro_x deviation [rad/s]", "gyro_x low [rad/s]", "gyro_x high [rad/s]"]
     at_1_s = min(table[1:], key=lambda row: abs(np.log(float(row[0]))))
     assert float(at_1_s[1]) * np.sqrt(float(at_1_s[0])) == pytest.approx(GYRO.white, rel=0.15)
     again = run("report", out)
@@ -171,6 +171,10 @@ def test_mistakes_are_one_line(run: Run, recording: Path, tmp_path: Path) -> Non
     assert "holes.csv" in run("allan", holes).mistake
     (tmp_path / "poses.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n")
     assert "no imu topic" in run("allan", tmp_path / "poses.csv").mistake
+    equal = write(tmp_path / "equal.csv", np.tile([0.01, 0.02, 0.03, 0.0, 0.0, 9.81], (3000, 1)))
+    assert "no axis ever changes" in run("allan", equal).mistake
+    stands = Path(__file__).parents[1] / "sample_bags" / "imu_stands.csv.gz"
+    assert "that is a recording for calibkit imu" in run("allan", stands).mistake
     other = write(tmp_path / "imu_b.csv", rest(60, seed=1))
     assert "which imu topic" in run("allan", recording, other).mistake
     assert "--kind parabolic" in run("allan", recording, "--kind", "parabolic").mistake
@@ -205,7 +209,7 @@ def test_a_dead_sensor_is_told_and_drawn_without(run: Run, tmp_path: Path) -> No
     report = tmp_path / "report"
     said = run("allan", write(tmp_path / "imu.csv", samples), "--report", report)
     assert said.code == 3, said
-    assert "gyroscope x never changes" in said.out
+    assert "gyro_x white, gyro_x flicker and gyro_x walk are not observable: every sample has the same value" in said.out
     assert (report / "imu0-allan-allan.png").exists()
 
 

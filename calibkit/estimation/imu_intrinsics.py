@@ -11,7 +11,7 @@ from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation.imu_fit import ImuFit, Samples, fit_imu
 from calibkit.estimation.imu_trust import Number, numbers_of
 from calibkit.estimation.imu_verdict import STILL_START_S, advice_for, reasons_for
-from calibkit.estimation.static_intervals import MIN_STANDS, find_stands
+from calibkit.estimation.static_intervals import MIN_STANDS, NoStandsError, find_stands
 from calibkit.models.imu import ImuModel
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def calibrate_imu(t: Array, gyro: Array, accel: Array, gravity: float, sensitivi
     try:
         return _calibrate(t, gyro, accel, gravity, sensitivity, name)
     except BadInputError as error:
-        raise BadInputError(f"{name}: {error}") from None
+        raise type(error)(f"{name}: {error}") from None
 
 
 def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool, name: str) -> ImuCalibration:
@@ -79,7 +79,7 @@ def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity:
     stands = find_stands(samples.t, samples.gyro, samples.accel, gravity)
     if len(stands) < MIN_STANDS:
         found = f"{counted(len(stands), 'still stand')} in {samples.t[-1]:.0f} s"
-        raise BadInputError(f"only {found}; begin with {STILL_START_S:.0f} s or more at rest, then 12 attitudes, each for 3 s")
+        raise NoStandsError(f"only {found}; begin with {STILL_START_S:.0f} s or more at rest, then 12 attitudes, each for 3 s")
     return _result(fit_imu(samples, stands, sensitivity), gravity, name)
 
 

@@ -49,7 +49,7 @@ def imu_result(
         verdict=worst(reasons),
         reasons=[reason.text.removeprefix(f"{name}: ") for reason in reasons],
     )
-    imu = before.model_copy(update={"topic": topic, "rate_hz": rate_hz, "intrinsics": intrinsics})
+    imu = before.model_copy(update={"topic": before.topic or topic, "rate_hz": before.rate_hz or rate_hz, "intrinsics": intrinsics})
     return Result(
         stage="imu",
         rig=Rig(imus={name: imu}),

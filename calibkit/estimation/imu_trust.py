@@ -52,6 +52,11 @@ def numbers_of(fit: ImuFit, gravity: float) -> Numbers:
         status = Status(trust.grade(float(sigma[i] / scale)))
         known = status is not Status.NOT_OBSERVABLE
         parameters[n] = Number(values[n], float(sigma[i]), float(sigma_plain[i]), status) if known else Number(None, None, None, status)
+    if any(parameters[f"M_a_{k}"].value is None for k in ("xx", "yy", "zz")):
+        # The gyroscope's axes are told by gravity's direction as the accelerometer has it: with one axis of that open, a wrong minimum is
+        # as good as the right one (seen: phi_z 143 sigma off where up stayed within 5 deg of z)
+        unknown = Number(None, None, None, Status.NOT_OBSERVABLE)
+        parameters |= {n: unknown for n in names if n.startswith(("M_g", "phi"))}
     known_at = [i for i, n in enumerate(names) if parameters[n].value is not None]
     return Numbers(values, parameters, tuple(names[i] for i in known_at), cov[np.ix_(known_at, known_at)])
 

@@ -19,7 +19,7 @@ AXES: dict[str, tuple[ImuAxis, ImuAxis, ImuAxis]] = {
     "accel": ("accel_x", "accel_y", "accel_z"),
 }
 _ORDER = (*AXES["gyro"], *AXES["accel"])
-_UNITS = {
+UNITS = {
     "gyro": {"quantisation": "rad", "white": "rad/s/sqrt(Hz)", "flicker": "rad/s", "walk": "rad/s^2/sqrt(Hz)", "ramp": "rad/s^2"},
     "accel": {"quantisation": "m/s", "white": "m/s^2/sqrt(Hz)", "flicker": "m/s^2", "walk": "m/s^3/sqrt(Hz)", "ramp": "m/s^3"},
 }
@@ -50,6 +50,7 @@ def noise_result(found: Rest, before: Imu, cut: bool) -> Result:
     reasons = [
         *_about_recording(found, cut),
         *_about_spectra(found),
+        *_about_weak(found),
         *(reason for axis in found.axes for reason in _about_axis(found, axis)),
     ]
     noise = {axis: _as_noise(axis, found.noise[axis]) for axis in found.axes}
@@ -63,7 +64,7 @@ def noise_result(found: Rest, before: Imu, cut: bool) -> Result:
     told = [reason.text.removeprefix(f"{found.name}: ") for reason in reasons if reason.verdict is not Verdict.PASS]
     imu = before.model_copy(
         update={
-            "topic": found.topic,
+            "topic": before.topic or found.topic,
             "rate_hz": found.rate,
             **_densities(found.axes, noise),
             "noise": {**before.noise, **noise},
@@ -92,6 +93,8 @@ def _about_recording(found: Rest, cut: bool) -> list[Reason]:
     lost = 1 - sum(found.hours) / total
     out = []
     for finding in found.findings:
+        if finding.kind == "frozen":  # said of the axis
+            continue
         gone = cut and finding.cut
         mild = gone or finding.kind in _HARMLESS
         where = (
@@ -112,7 +115,7 @@ def _about_spectra(found: Rest) -> list[Reason]:
         if lines:
             hz, size, axis = max(lines, key=lambda line: line[1])
             others = ", ".join(dict.fromkeys(f"{line[0]:.2g}" for line in lines))
-            text = f"periodic at {others} Hz, the largest {size:.2g} {_UNITS[sensor]['flicker']} at {hz:.3g} Hz on {axis}"
+            text = f"periodic at {others} Hz, the largest {size:.2g} {UNITS[sensor]['flicker']} at {hz:.3g} Hz on {axis}"
             out.append(Reason(Verdict.CHECK, f"{found.name}: {sensor}: {text}: vibration or interference? Left out of N, B and K"))
         for kind, verdict, what in (
             ("filter", Verdict.PASS, "a low-pass filter acts"),
@@ -125,12 +128,26 @@ def _about_spectra(found: Rest) -> list[Reason]:
     return out
 
 
+def _about_weak(found: Rest) -> list[Reason]:
+    """Return which coefficients are known to a factor only, with their 95 % intervals."""
+    out = []
+    for sensor, key in product(AXES, _LETTERS):
+        terms = [(axis, getattr(found.noise[axis], key)) for axis in AXES[sensor] if axis in found.noise]
+        weak = [f"{axis[-1]} {t.lower95:.2g} to {t.upper95:.2g}" for axis, t in terms if t is not None and t.status is Status.WEAK]
+        if weak:
+            text = f"{key} ({_LETTERS[key]}) is weak: 95 % intervals {', '.join(weak)} {UNITS[sensor][key]}; a longer recording tells more"
+            out.append(Reason(Verdict.CHECK, f"{found.name}: {sensor} {text}"))
+    return out
+
+
 def _about_axis(found: Rest, axis: ImuAxis) -> list[Reason]:
     """Return what speaks against the noise model of one axis, and which coefficients the recording does not tell."""
     noise, name = found.noise[axis], f"{found.name}: {axis}"
-    out = [Reason(Verdict.CHECK, f"{name}: {text}") for text in noise.reasons]
+    if noise.reasons:  # a stuck axis tells nothing else
+        return [Reason(Verdict.FAIL, f"{name} white, {axis} flicker and {axis} walk are not observable: {'; '.join(noise.reasons)}")]
+    out: list[Reason] = []
     if noise.markov is not None:
-        size = f"{noise.markov.sigma:.2g} {_UNITS[axis[:-2]]['flicker']}"
+        size = f"{noise.markov.sigma:.2g} {UNITS[axis[:-2]]['flicker']}"
         text = f"correlated noise of {size} over {noise.markov.time_s:.2g} s beside N, B and K"
         out.append(
             Reason(
@@ -154,18 +171,22 @@ def _about_axis(found: Rest, axis: ImuAxis) -> list[Reason]:
     return out
 
 
+def _duration(hours: float) -> str:
+    return f"{hours:.3g} h" if hours >= 1 else f"{hours * 60:.3g} min"
+
+
 def _needed(axis: ImuAxis, key: str, term: NoiseTerm) -> str:
-    unit = _UNITS[axis[:-2]][key]
+    unit = UNITS[axis[:-2]][key]
     at_most = f": at most {term.upper95:.2g} {unit} (95 %)" if term.upper95 > 0 else ""
     if term.hours_needed is None or term.resolves is None:
         return at_most
     if not np.isfinite(term.hours_needed):
         return f"{at_most}; no recording of a sensible length would tell {term.resolves:.2g} from none"
-    return f"{at_most}; longer than {term.hours_needed:.2g} h needed to tell {term.resolves:.2g} from none"
+    return f"{at_most}; longer than {_duration(term.hours_needed)} needed to tell {term.resolves:.2g} from none"
 
 
 def _as_noise(axis: ImuAxis, noise: AxisNoise) -> Noise:
-    units = _UNITS[axis[:-2]]
+    units = UNITS[axis[:-2]]
 
     def estimate(key: str) -> Estimate | None:
         term: NoiseTerm | None = getattr(noise, key)
@@ -180,7 +201,7 @@ def _densities(axes: Sequence[ImuAxis], noise: dict[ImuAxis, Noise]) -> dict[str
     for sensor, (key, name) in product(AXES, _DENSITIES.items()):
         all_axes = [getattr(noise[axis], key) for axis in axes if axis in AXES[sensor]]
         known = [estimate for estimate in all_axes if estimate.value is not None]
-        unit = _UNITS[sensor][key]
+        unit = UNITS[sensor][key]
         if not all_axes:
             continue
         if not known:
@@ -216,7 +237,7 @@ def _residuals(found: Rest) -> ResidualSet:
 def _lines(found: Rest) -> list[str]:
     whole = sum(found.hours)
     in_pieces = "" if len(found.hours) == 1 else f" in {counted(len(found.hours), 'piece')}"
-    return [f"{found.name}: {found.topic}, {found.rate:.4g} Hz; {whole:.3g} h at rest{in_pieces} used"]
+    return [f"{found.name}: {found.topic}, {found.rate:.4g} Hz; {_duration(whole)} at rest{in_pieces} used"]
 
 
 def _facts(noise: AxisNoise) -> dict[str, object]:

@@ -26,6 +26,10 @@ _SCANNED = 12  # stands and more can choose the multiplier
 MIN_STANDS = 6
 
 
+class NoStandsError(BadInputError):
+    """The recording holds too few stands to begin with."""
+
+
 @dataclass(frozen=True)
 class Stands:
     """Stands of one recording, in its units; rows [first, last) of the samples."""
@@ -69,12 +73,12 @@ def find_stands(t: Array, gyro: Array, accel: Array, gravity: float) -> Stands:
         best = int(np.argmax(scores >= np.max(scores) - _AS_GOOD))
     first, last = choices[best]
     if len(first) == 0:
-        raise BadInputError(f"the IMU never stood still for {_SHORTEST_S + _WINDOW_S:.1f} s: put it down, still, in 12 or more attitudes")
+        raise NoStandsError(f"the IMU never stood still for {_SHORTEST_S + _WINDOW_S:.1f} s: put it down, still, in 12 or more attitudes")
     stands = _stands(t, gyro, accel, first, last, float(_MULTIPLIERS[best]))
     wandering = np.sqrt(np.mean(np.sum((stands.gyro - np.median(stands.gyro, axis=0)) ** 2, axis=1)))
     overall = np.sqrt(np.mean(np.sum((gyro - np.median(stands.gyro, axis=0)) ** 2, axis=1)))
     if len(stands) > 1 and wandering > _TURNS_STILL * overall:
-        raise BadInputError(
+        raise NoStandsError(
             "the IMU never stood still, or never moved: its quietest parts turn about as much as the others; "
             "put it down, still, in 12 or more attitudes (calibkit allan is for a recording at rest)"
         )

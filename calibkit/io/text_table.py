@@ -22,6 +22,7 @@ Times = NDArray[np.int64]
 SUFFIXES = (".csv", ".txt", ".tum", ".mat")  # .mat: text under the name of Matlab's, which is binary and refused
 _MAX_FILE = 2**31  # bytes, unpacked
 _BLOCK = 2**22  # bytes read at once
+_MAX_ROWS = 30_000_000  # 41 h at 200 Hz, 2 GB as arrays
 _MAX_LINE = 2**16  # bytes
 _MAX_HEADER = 1000  # lines
 _MAX_DIGITS = 20  # of a time before its point
@@ -136,12 +137,15 @@ class TextTable:
     def read(self, *names: str, with_times: bool = True, progress: Progress = silent) -> tuple[Times, Array]:
         """Return times in ns (n,), empty where they are not asked for, and the named columns (n, k) in SI, in one pass."""
         t_ns, values = Rows((), np.int64), Rows((len(names),), np.float64)
-        scales = np.array([self.scale(name) for name in names])
+        scales, rows = np.array([self.scale(name) for name in names]), 0
         for lines in progress(self._blocks(), f"reading {self.name}"):
             if with_times:
                 t_ns.add(self._times(lines))
             if names:
                 values.add(self._numbers(lines, names) * scales)
+            rows += len(lines)
+            if rows > _MAX_ROWS:
+                raise BadInputError(f"{self.name} has more than {_MAX_ROWS} rows: split it, or record a bag")
         return t_ns.take(), values.take()
 
     def _numbers(self, lines: list[str], names: tuple[str, ...]) -> Array:

@@ -61,7 +61,8 @@ def _slopes(panel: Axes, noise: Noise, colour: str, tau: Array) -> None:
     ):
         if estimate.value is not None:
             panel.plot(reach, factor * estimate.value * (reach / at) ** slope, color=colour, lw=0.6, ls=(0, (1, 3)), scaley=False)
-            panel.plot([at], [factor * estimate.value], color="black", marker=mark, ms=6, lw=0, scalex=False)
+            seen = at if slope <= 0 else reach[1]  # K's own place, 3 s, lies far below the curve
+            panel.plot([seen], [factor * estimate.value * (seen / at) ** slope], color="black", marker=mark, ms=6, lw=0, scalex=False)
 
 
 def stands(figure: Figure, view: View) -> None:

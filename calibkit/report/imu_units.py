@@ -2,6 +2,8 @@
 
 from math import pi
 
+from calibkit.models.imu import FLOOR
+
 G = 9.80665  # m/s^2
 _DEG = 180 / pi
 
@@ -20,7 +22,13 @@ _PEOPLE = {
 }
 
 
+LETTERS = {"white": "N", "flicker": "B", "walk": "K", "quantisation": "Q", "ramp": "R"}
+
+
 def for_people(sensor: str, coefficient: str, value: float) -> str:
     """Return a coefficient of `data.rig.Noise` in SI, of "gyro" or "accel", as datasheets have it."""
     factor, unit = _PEOPLE[sensor, coefficient]
-    return f"{value * factor:.3g} {unit}"
+    floor = (
+        f", Allan floor {FLOOR * value * factor:.3g}" if coefficient == "flicker" else ""
+    )  # many datasheets mean that by bias instability
+    return f"{value * factor:.3g} {unit}{floor}"

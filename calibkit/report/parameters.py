@@ -10,7 +10,7 @@ from calibkit.data.rig import Camera, Estimate, Imu, ImuIntrinsics, Noise, Rig, 
 from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
-from calibkit.report.imu_units import for_people
+from calibkit.report.imu_units import LETTERS, for_people
 
 _SIGMA_NOTE = "sigma is one standard deviation, plain takes residuals as independent; factor is their ratio: it covers what residuals share"
 _CAMERA_NOTE = "neighbouring frames have errors in common, and the detector always errs alike at one place of the image"
@@ -93,7 +93,7 @@ def rows(rig: Rig) -> list[Row]:
 
 
 def _noise_row(imu: str, axis: str, coefficient: str, estimate: Estimate) -> Row:
-    note = "" if estimate.value is None else for_people(axis[:-2], coefficient, estimate.value)
+    note = "" if estimate.value is None else f"{LETTERS[coefficient]}: {for_people(axis[:-2], coefficient, estimate.value)}"
     return _row(imu, f"{axis} {coefficient}", estimate, note)
 
 

@@ -16,7 +16,7 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.allan import Deviation, deviation, log_spaced
 from calibkit.estimation.imu_noise import AxisNoise, fit_noise
 from calibkit.estimation.imu_screening import clean, rate_hz, screen
-from calibkit.estimation.noise_result import AXES, Rest, noise_result
+from calibkit.estimation.noise_result import AXES, UNITS, Rest, noise_result
 from calibkit.io.atomic import refuse_unwritable, write_atomic
 from calibkit.io.imu_options import ImuOptions
 from calibkit.stages.imu_source import open_imu
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 KINDS = ("overlapping", "modified", "hadamard")
 _DEFAULT = ImuOptions()
+_PARTS = 500  # of the recording, whose mean directions of gravity are compared
+_TURNED, _OFTEN = np.radians(20.0), 0.2  # from the longest piece's, and how often that makes a recording of stands
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,10 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
         moving = next((finding for finding in findings if finding.kind == "moving"), None)
         if moving is not None:
             raise BadInputError(moving.text)
-        pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
+        pieces = clean(source.samples, findings)
+        _refuse_turned(source.samples, pieces)
+        if not options.cut:
+            pieces = clean(source.samples, [finding for finding in findings if finding.kind == "gap"])
         rate = rate_hz(np.concatenate([piece.t_ns for piece in pieces]))  # in order, each sample once
         fitted = _fit(pieces, rate, progress)
     except BadInputError as error:
@@ -75,7 +80,7 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     longest = max(pieces, key=lambda piece: len(piece.t_ns))
     curve = _deviation(longest, rate, "overlapping", options.exact)
     hours = [_hours(piece, rate) for piece in pieces]
-    rest = Rest(source.name, source.topic, rate, axes, noise, curve, findings, hours, _hours(source.samples, rate))
+    rest = Rest(source.name, source.topic, rate, axes, noise, curve, findings, hours, float(np.ptp(source.samples.t_ns)) / 3.6e12)
     result = noise_result(rest, base.imus.get(source.name, Imu()), options.cut)
     result = replace(result, facts={**result.facts, "warnings": source.recording.warnings})
     saved = save(result, base, outputs, source.recording.inputs(), _told(options))
@@ -84,6 +89,19 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     shown = curve if options.kind == "overlapping" else _deviation(longest, rate, options.kind, options.exact)
     write_atomic(options.table, _csv(shown, axes), outputs.force)
     return replace(saved, files=(*saved.files, options.table))
+
+
+def _refuse_turned(samples: ImuSamples, pieces: Sequence[ImuSamples]) -> None:
+    """Raise BadInputError where no axis ever changes, or gravity points elsewhere for much of the time than in the longest piece."""
+    if not any(np.ptp(array, axis=0).any() for array in (samples.gyro, samples.accel) if array.size):
+        raise BadInputError("no axis ever changes: the driver does not fill it, or every sample is the same")
+    if not samples.has_accel:
+        return
+    parts = np.array([part.mean(axis=0) for part in np.array_split(samples.accel, min(len(samples.t_ns), _PARTS))])
+    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-12)
+    at_rest = max(pieces, key=lambda piece: len(piece.t_ns)).accel.mean(axis=0)
+    if np.mean(parts @ at_rest < np.cos(_TURNED) * np.linalg.norm(at_rest)) > _OFTEN:
+        raise BadInputError("it was put down in several attitudes: that is a recording for calibkit imu; leave it in one for hours")
 
 
 def _fit(pieces: Sequence[ImuSamples], rate: float, progress: Progress) -> list[AxisNoise]:
@@ -106,7 +124,9 @@ def _csv(curve: Deviation, axes: Sequence[ImuAxis]) -> str:
     """Return the table of deviations in SI: one line an averaging time, of each axis the deviation and its 95 % interval."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["tau [s]", *(f"{axis} {part}" for axis in axes for part in ("deviation", "low", "high"))])
+    writer.writerow(
+        ["tau [s]", *(f"{axis} {part} [{UNITS[axis[:-2]]['flicker']}]" for axis in axes for part in ("deviation", "low", "high"))]
+    )
     for k, tau in enumerate(curve.tau):
         values = np.stack([curve.dev[k], curve.lower[k], curve.upper[k]], axis=1).ravel()
         writer.writerow([f"{tau:.9g}", *(f"{value:.6e}" for value in values)])

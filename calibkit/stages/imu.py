@@ -16,6 +16,7 @@ from calibkit.estimation.imu_intrinsics import ImuCalibration, calibrate_imu
 from calibkit.estimation.imu_result import imu_result
 from calibkit.estimation.imu_table_fit import fit_table, table_alone, with_table
 from calibkit.estimation.imu_times import in_order, rate_hz
+from calibkit.estimation.static_intervals import NoStandsError
 from calibkit.io.imu_options import ImuOptions
 from calibkit.io.turntable_file import load_turntable
 from calibkit.models.imu import STANDARD_GRAVITY, Gravity
@@ -70,7 +71,7 @@ def _calibrate(t: NDArray[np.float64], samples: ImuSamples, options: Options, na
     table = None if options.turntable is None else fit_table(samples, load_turntable(options.turntable))
     try:
         found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, name)
-    except BadInputError:
+    except NoStandsError:
         if table is None:
             raise
         return table_alone(table, name)  # a recording of the table alone has no stands

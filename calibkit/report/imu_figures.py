@@ -52,7 +52,7 @@ def _curve(panel: Axes, view: View, rows: Index, name: ImuAxis) -> None:
 
 
 def _slopes(panel: Axes, noise: Noise, colour: str, tau: Array) -> None:
-    """Mark N at tau = 1 s on its slope -1/2, B at its flat floor, K at tau = 3 s on its slope +1/2."""
+    """Mark N at tau = 1 s on its slope -1/2, B on its flat floor, K on its slope +1/2 at the longest tau (3 s lies far below)."""
     reach = np.array([tau.min(), tau.max()])
     for estimate, slope, at, factor, mark in (
         (noise.white, -0.5, 1.0, 1.0, "*"),

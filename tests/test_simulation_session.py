@@ -16,7 +16,8 @@ from calibkit.geometry import se3
 from calibkit.io.recording import open_recording
 from calibkit.io.rig_file import load_rig
 from calibkit.io.target_file import load_target
-from calibkit.simulation.faults import FAULTS, STANDARD_GRAVITY, apply_faults
+from calibkit.models.imu import STANDARD_GRAVITY
+from calibkit.simulation.faults import FAULTS, apply_faults
 from calibkit.simulation.scenarios import SCENARIOS
 from calibkit.simulation.session import START_NS, Session, simulate_session, simulate_views
 from calibkit.simulation.truth import true_rig
@@ -131,7 +132,7 @@ def test_faults_are_as_large_as_they_say() -> None:
     assert np.all(image["zero-stamps"] == 0)
     assert np.diff(apply_faults(run, ["imu-gap"]).imu.t_ns).max() == pytest.approx(5e8, abs=1e7)
     assert np.sum(apply_faults(run, ["accel-spike"]).imu.accel == 400) == 1
-    assert np.allclose(apply_faults(run, ["accel-in-g"]).imu.accel * STANDARD_GRAVITY, run.imu.accel)
+    assert np.allclose(apply_faults(run, ["accel-in-g"]).imu.accel * STANDARD_GRAVITY.value, run.imu.accel)
     assert np.allclose(np.radians(apply_faults(run, ["gyro-in-deg"]).imu.gyro), run.imu.gyro)
     assert apply_faults(run, ["board-size"]).board_told.tag_size == pytest.approx(0.080)
     assert apply_faults(run, ["tag-spacing"]).board_told.spacing == pytest.approx(0.2)

@@ -1,11 +1,11 @@
 """`calibkit imu`: from an IMU put down in many attitudes to its scale, axes and biases."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from calibkit.cli import options
 
 if TYPE_CHECKING:
     from calibkit.models.imu import Gravity
@@ -24,13 +24,11 @@ def run(
             help="Bags or CSV files: 10 s at rest, then 12 or more attitudes, still for 3 s each. Files acc... and gyr... make one IMU.",
         ),
     ],
-    imu: Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")
-    ] = None,
-    rig: Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add it to; repeatable.")] = None,
-    report: Annotated[Path | None, typer.Option("--report", metavar="DIR", help="Write the report (HTML, pictures, JSON) here.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
+    imu: options.Imu = None,
+    out: options.Out = None,
+    rig: options.Rigs = None,
+    report: options.Report = None,
+    json_file: options.Json = None,
     gravity: Annotated[
         float | None, typer.Option("--gravity", metavar="M/S2", help="|g| where it was recorded. [default: 9.80665]")
     ] = None,
@@ -43,34 +41,24 @@ def run(
     sensitivity: Annotated[
         bool, typer.Option("--g-sensitivity", help="Estimate the gyroscope's sensitivity to acceleration, too.")
     ] = False,
-    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Samples per second of a file without times.")] = None,
-    gyro_unit: Annotated[
-        str | None, typer.Option("--gyro-unit", help="Unit of a file that does not say it: rad/s, deg/s, counts, ... [default: rad/s]")
-    ] = None,
-    accel_unit: Annotated[
-        str | None, typer.Option("--accel-unit", help="Unit of a file that does not say it: m/s^2, g, counts, ... [default: m/s^2]")
-    ] = None,
-    ros_distro: Annotated[
-        str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite outputs.")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")] = False,
+    rate: options.Rate = None,
+    gyro_unit: options.GyroUnit = None,
+    accel_unit: options.AccelUnit = None,
+    ros_distro: options.RosDistro = None,
+    force: options.Force = False,
+    strict: options.Strict = False,
 ) -> None:
     """Scale, axes and biases of an IMU that was put down in many attitudes, in one joint estimate with sigmas.
 
     Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the attitudes do not tell everything, and what to add is said; 4: no solution.
     """
-    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
     from calibkit.io.imu_options import ImuOptions
     from calibkit.stages.imu import Options
     from calibkit.stages.imu import imu as stage
-    from calibkit.stages.outputs import Outputs
 
-    refuse_clashes([*sources, *([turntable] if turntable else [])], [out, report, json_file])
-    refuse_clashes(rig or (), [report, json_file])  # OUT may be a rig: it is then updated
-    options = Options(
+    asked = Options(
         imu=imu,
         reading=ImuOptions(rate, gyro_unit, accel_unit),
         gravity=_gravity(gravity, latitude, altitude),
@@ -78,8 +66,8 @@ def run(
         turntable=turntable,
         ros_distro=ros_distro,
     )
-    outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
-    show(stage(sources, outputs, options, bar), strict)
+    outputs = options.outputs_of([*sources, *([turntable] if turntable else [])], out, report, json_file, rig, force)
+    show(stage(sources, outputs, asked, bar), strict)
 
 
 def _gravity(value: float | None, latitude: float | None, altitude: float | None) -> "Gravity":

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibkit.cli import options
+
 if TYPE_CHECKING:
     from calibkit.stages.info import Info
 
@@ -19,12 +21,10 @@ def run(
         list[Path], typer.Argument(metavar="SOURCE...", help="Bags, image folders, ASL folders or CSV files, on one clock.")
     ],
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
-    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Samples per second of an IMU's file without times.")] = None,
-    gyro_unit: Annotated[str | None, typer.Option("--gyro-unit", help="Unit of an IMU's file that does not say it.")] = None,
-    accel_unit: Annotated[str | None, typer.Option("--accel-unit", help="Unit of an IMU's file that does not say it.")] = None,
-    ros_distro: Annotated[
-        str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")
-    ] = None,
+    rate: options.Rate = None,
+    gyro_unit: options.GyroUnit = None,
+    accel_unit: options.AccelUnit = None,
+    ros_distro: options.RosDistro = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite FILE.")] = False,
 ) -> None:
     """Show topics, rates and duration of a recording, what is wrong with it, and what each topic could be used for."""

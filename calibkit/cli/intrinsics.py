@@ -1,11 +1,11 @@
 """`calibkit intrinsics`: from a recording of a board to calibrated cameras."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from calibkit.cli import options
 
 
 def register(app: typer.Typer) -> None:
@@ -29,12 +29,10 @@ def run(
             help="auto (by held-out error), pinhole-radtan, pinhole-radtan5, pinhole-radtan8, pinhole-equi (kb4); once or per camera.",
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, its residuals beside it.")
-    ] = None,
-    rig: Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add the cameras to; repeatable.")] = None,
-    report: Annotated[Path | None, typer.Option("--report", metavar="DIR", help="Write the report (HTML, pictures, JSON) here.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
+    out: options.Out = None,
+    rig: options.Rigs = None,
+    report: options.Report = None,
+    json_file: options.Json = None,
     resolution: Annotated[
         str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")
     ] = None,
@@ -43,28 +41,22 @@ def run(
     ] = "robust",
     max_views: Annotated[int, typer.Option("--max-views", min=10, help="Beyond this many, the most telling moments are chosen.")] = 1500,
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")] = False,
-    ros_distro: Annotated[
-        str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite outputs.")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")] = False,
+    ros_distro: options.RosDistro = None,
+    force: options.Force = False,
+    strict: options.Strict = False,
 ) -> None:
     """Calibrate cameras: lens, sigma of every number, verdict with reasons; several cameras with the transforms between them.
 
     Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
     """
-    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
     from calibkit.errors import BadInputError
     from calibkit.stages.intrinsics import AUTO, Options, intrinsics
-    from calibkit.stages.outputs import Outputs
 
     if loss not in ("robust", "plain"):
         raise BadInputError("--loss is robust or plain")
-    refuse_clashes([*sources, target], [out, report, json_file])
-    refuse_clashes(rig or (), [report, json_file])  # OUT may be a rig: it is then updated
-    options = Options(
+    asked = Options(
         cameras=tuple(camera or ()),
         models=tuple(model or (AUTO,)),
         resolution=_size(resolution),
@@ -73,8 +65,8 @@ def run(
         cache=not no_cache,
         ros_distro=ros_distro,
     )
-    outputs = Outputs(out, report, json_file, tuple(rig or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
-    show(intrinsics(sources, target, outputs, options, bar), strict)
+    outputs = options.outputs_of([*sources, target], out, report, json_file, rig, force)
+    show(intrinsics(sources, target, outputs, asked, bar), strict)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

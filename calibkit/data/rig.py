@@ -5,7 +5,7 @@ whatever contradicts itself: a quaternion that is not the matrix, a covariance t
 """
 
 from pathlib import PurePosixPath, PureWindowsPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +42,7 @@ Row = Annotated[list[Finite], Field(max_length=400)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Vector4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 ImuAxis = Literal["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
+IMU_AXES: tuple[ImuAxis, ...] = get_args(ImuAxis)
 Matrix4 = Annotated[list[Vector4], Field(min_length=4, max_length=4)]
 
 

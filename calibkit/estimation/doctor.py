@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from calibkit.data.plural import counted
 from calibkit.geometry import so3
+from calibkit.models.imu import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
-G = 9.80665  # m/s^2
+G = STANDARD_GRAVITY.value
 
 _GAP = 1.75  # median intervals; above, a sample or more is missing
 _DAY_S = 86400  # clocks further apart do not count from the same epoch

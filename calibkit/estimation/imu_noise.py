@@ -27,12 +27,12 @@ from calibkit.estimation.noise_shape import (
     misfits,
 )
 from calibkit.estimation.noise_spectrum import TERMS, Spectrum, spectrum
+from calibkit.models.noise import FLOOR
 
 Array = NDArray[np.float64]
 
 MIN_SAMPLES = 400
 _DETERMINED = 2.0  # upper over lower end of the 95 % interval up to which a term counts as determined
-_AVAR = 2 * np.log(2) / np.pi
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def fit_noise(x: NDArray[np.floating] | Sequence[NDArray[np.floating]], rate_hz:
 def model_deviation(noise: AxisNoise, tau: Array) -> Array:
     """Return the fitted model's Allan deviation at tau (s); terms that are not observable count with their likeliest value."""
     best = noise.best
-    variance = best["white"] ** 2 / tau + _AVAR * best["flicker"] ** 2 + best["walk"] ** 2 * tau / 3
+    variance = best["white"] ** 2 / tau + (FLOOR * best["flicker"]) ** 2 + best["walk"] ** 2 * tau / 3
     variance = variance + 3 * best["quantisation"] ** 2 / tau**2 + best["ramp"] ** 2 * tau**2 / 2
     if noise.markov is not None:
         u = tau / noise.markov.time_s

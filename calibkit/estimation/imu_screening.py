@@ -11,9 +11,11 @@ from calibkit.estimation import imu_motion, imu_times, imu_values
 from calibkit.estimation.findings import Finding
 from calibkit.estimation.imu_times import rate_hz
 
-__all__ = ["Finding", "clean", "rate_hz", "screen"]
+__all__ = ["Finding", "clean", "rate_hz", "refuse_no_rest", "screen"]
 
 Array = NDArray[np.float64]
+_PARTS = 500  # of the recording, whose mean directions of gravity are compared
+_TURNED, _OFTEN = np.radians(20.0), 0.2  # from the longest piece's, and how often that makes a recording of stands
 _LEAST_S = 10.0  # pieces that are shorter say nothing
 
 
@@ -44,6 +46,22 @@ def screen(samples: ImuSamples) -> list[Finding]:
     found += imu_values.check_repeats(both, end)
     found += imu_values.check_gravity(ordered.accel, end) if si and accel else []
     return sorted(found, key=lambda finding: finding.t_start_s)
+
+
+def refuse_no_rest(samples: ImuSamples, findings: list[Finding]) -> None:
+    """Raise BadInputError where the IMU moves throughout, no axis ever changes, or gravity often points elsewhere than at its rest."""
+    moving = next((finding for finding in findings if finding.kind == "moving"), None)
+    if moving is not None:
+        raise BadInputError(moving.text)
+    if not any(np.ptp(array, axis=0).any() for array in (samples.gyro, samples.accel) if array.size):
+        raise BadInputError("no axis ever changes: the driver does not fill it, or every sample is the same")
+    if not samples.has_accel:
+        return
+    parts = np.array([part.mean(axis=0) for part in np.array_split(samples.accel, min(len(samples.t_ns), _PARTS))])
+    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-12)
+    at_rest = max(clean(samples, findings), key=lambda piece: len(piece.t_ns)).accel.mean(axis=0)
+    if np.mean(parts @ at_rest < np.cos(_TURNED) * np.linalg.norm(at_rest)) > _OFTEN:
+        raise BadInputError("it was put down in several attitudes: that is a recording for calibkit imu; leave it in one for hours")
 
 
 def clean(samples: ImuSamples, findings: list[Finding]) -> list[ImuSamples]:

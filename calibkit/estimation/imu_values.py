@@ -7,10 +7,11 @@ from scipy.stats import chi2
 
 from calibkit.data.plural import counted
 from calibkit.estimation.findings import Finding
+from calibkit.models.imu import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-G = 9.80665  # m/s^2
+G = STANDARD_GRAVITY.value
 _SAMPLE = 2**16  # values that a step is looked for in
 _TOLD = 0.05  # noise sigmas; smaller steps do not matter
 _RESOLVED = 0.5  # steps of noise; below, the noise cannot carry what lies between two steps

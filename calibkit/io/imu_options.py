@@ -8,8 +8,9 @@ import numpy as np
 
 from calibkit.data.observations import ImuUnit
 from calibkit.errors import BadInputError, one_line
+from calibkit.models.imu import STANDARD_GRAVITY
 
-G = 9.80665  # m/s^2
+G = STANDARD_GRAVITY.value
 COUNTS = ("counts", "count", "raw", "lsb")
 # Units as headers write them, lower case, and what they are worth in SI; of none SI is meant. Raw counts stay as they are.
 _RAW = dict.fromkeys(COUNTS, 1.0)

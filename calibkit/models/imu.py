@@ -9,7 +9,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import log, pi, radians, sin, sqrt
+from math import radians, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from calibkit.geometry import so3
 
 Array = NDArray[np.float64]
 
-FLOOR = sqrt(2 * log(2) / pi)  # the Allan deviation of flicker noise B is flat at FLOOR B (IEEE Std 952)
 LOWER = ("xx", "yx", "yy", "zx", "zy", "zz")  # of a lower triangular matrix, row by row
 AXES = ("x", "y", "z")
 ACCEL_PARAMETERS = (*(f"M_a_{k}" for k in LOWER), *(f"b_a_{k}" for k in AXES))

@@ -6,12 +6,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from calibkit.data.rig import ImuAxis, Noise
-from calibkit.models.imu import FLOOR
+from calibkit.data.rig import IMU_AXES, ImuAxis, Noise
+from calibkit.models.noise import FLOOR
 from calibkit.report.imu_units import for_people
 from calibkit.report.view import Array, Index, View, given
 
-AXES: tuple[ImuAxis, ...] = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 _LOOK = {"x": ("#1f3b57", "o"), "y": ("#c1440e", "s"), "z": ("#3f7d58", "^")}
 
@@ -21,7 +20,7 @@ def allan(figure: Figure, view: View) -> None:
     axis = given(view.axis)
     sensors = [(name, first) for name, first in (("gyro", 0), ("accel", 3)) if np.any((axis >= first) & (axis < first + 3))]
     for panel, (sensor, first) in zip(np.ravel(figure.subplots(1, len(sensors), squeeze=False)), sensors, strict=True):
-        for k, name in enumerate(AXES):
+        for k, name in enumerate(IMU_AXES):
             rows = np.flatnonzero(axis == k)
             if name.startswith(sensor) and len(rows):
                 _curve(panel, view, rows, name)

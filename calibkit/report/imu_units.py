@@ -2,9 +2,10 @@
 
 from math import pi
 
-from calibkit.models.imu import FLOOR
+from calibkit.models.imu import STANDARD_GRAVITY
+from calibkit.models.noise import FLOOR
 
-G = 9.80665  # m/s^2
+_G = STANDARD_GRAVITY.value
 _DEG = 180 / pi
 
 # What a noise coefficient of a gyroscope or an accelerometer is multiplied by, and the unit that it then has.
@@ -15,14 +16,11 @@ _PEOPLE = {
     ("gyro", "walk"): (_DEG * 3600 * 60, "deg/h/sqrt(h)"),
     ("gyro", "ramp"): (_DEG * 3600 * 3600, "deg/h/h"),
     ("accel", "quantisation"): (1e3, "mm/s"),
-    ("accel", "white"): (1e6 / G, "ug/sqrt(Hz)"),
-    ("accel", "flicker"): (1e6 / G, "ug"),
-    ("accel", "walk"): (1e6 / G * 60, "ug/sqrt(h)"),
-    ("accel", "ramp"): (1e6 / G * 3600, "ug/h"),
+    ("accel", "white"): (1e6 / _G, "ug/sqrt(Hz)"),
+    ("accel", "flicker"): (1e6 / _G, "ug"),
+    ("accel", "walk"): (1e6 / _G * 60, "ug/sqrt(h)"),
+    ("accel", "ramp"): (1e6 / _G * 3600, "ug/h"),
 }
-
-
-LETTERS = {"white": "N", "flicker": "B", "walk": "K", "quantisation": "Q", "ramp": "R"}
 
 
 def for_people(sensor: str, coefficient: str, value: float) -> str:

@@ -10,7 +10,8 @@ from calibkit.data.rig import Camera, Estimate, Imu, ImuIntrinsics, Noise, Rig, 
 from calibkit.data.transforms import TANGENT
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
-from calibkit.report.imu_units import LETTERS, for_people
+from calibkit.models.noise import LETTERS
+from calibkit.report.imu_units import for_people
 
 _SIGMA_NOTE = "sigma is one standard deviation, plain takes residuals as independent; factor is their ratio: it covers what residuals share"
 _CAMERA_NOTE = "neighbouring frames have errors in common, and the detector always errs alike at one place of the image"

@@ -43,7 +43,6 @@ class View:
     low: Array | None = None  # (n,) 95 % interval
     high: Array | None = None
     attitude: Array | None = None  # (n, 3) unit vector of gravity's reaction in the IMU's frame
-    time: Array | None = None  # (n,) s from the first row
     noise: Mapping[ImuAxis, Noise] = field(default_factory=dict)  # of an IMU, by axis
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
@@ -134,7 +133,6 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         low=floats("low"),
         high=floats("high"),
         attitude=floats("attitude", 3),
-        time=(residuals.t_ns[good] - residuals.t_ns[good].min()) / 1e9 if good.any() and residuals.t_ns.any() else None,
     )
 
 

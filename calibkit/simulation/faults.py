@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from calibkit.data.observations import ImuSamples
 from calibkit.errors import BadInputError, one_line
 from calibkit.models.board import AprilGrid, Charuco, Checkerboard, CircleGrid
+from calibkit.models.imu import STANDARD_GRAVITY
 from calibkit.simulation.session import Session, Track
 
 Fault = Callable[[Session, np.random.Generator], Session]
 Mask = NDArray[np.bool_]
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
 # Which fields of a board are lengths that a person may have measured wrongly.
 _LENGTHS = {
     AprilGrid.kind: ("tag_size",),
@@ -119,7 +119,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "zero-stamps": ("all image stamps are zero", _tracks(lambda track, rng: replace(track, stamp_ns=np.zeros_like(track.stamp_ns)))),
     "imu-gap": ("0.5 s without IMU", _imu_gap),
     "accel-spike": ("one accelerometer value of 400 m/s^2", _imu(_accel_spike)),
-    "accel-in-g": ("accelerometer in g", _imu(lambda imu, rng: replace(imu, accel=imu.accel / STANDARD_GRAVITY))),
+    "accel-in-g": ("accelerometer in g", _imu(lambda imu, rng: replace(imu, accel=imu.accel / STANDARD_GRAVITY.value))),
     "gyro-in-deg": ("gyroscope in deg/s", _imu(lambda imu, rng: replace(imu, gyro=np.degrees(imu.gyro)))),
     "board-size": ("target.yaml has the board a tenth too small (0.080 m for 0.088 m)", _board_size),
     "tag-spacing": ("target.yaml has tagSpacing 0.2 for 0.3", _tag_spacing),

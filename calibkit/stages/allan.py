@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from calibkit.data.observations import ImuSamples
 from calibkit.data.progress import Progress, silent
-from calibkit.data.rig import Imu, ImuAxis
+from calibkit.data.rig import IMU_AXES, Imu, ImuAxis
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.allan import Deviation, deviation, log_spaced
 from calibkit.estimation.imu_noise import AxisNoise, fit_noise
-from calibkit.estimation.imu_screening import clean, rate_hz, screen
-from calibkit.estimation.noise_result import AXES, UNITS, Rest, noise_result
+from calibkit.estimation.imu_screening import clean, rate_hz, refuse_no_rest, screen
+from calibkit.estimation.noise_result import noise_result
+from calibkit.estimation.noise_verdict import Rest
 from calibkit.io.atomic import refuse_unwritable, write_atomic
 from calibkit.io.imu_options import ImuOptions
+from calibkit.models.noise import UNITS
 from calibkit.stages.imu_source import open_imu
 from calibkit.stages.outputs import Outputs, Saved, save
 
@@ -26,8 +28,6 @@ Array = NDArray[np.float64]
 
 KINDS = ("overlapping", "modified", "hadamard")
 _DEFAULT = ImuOptions()
-_PARTS = 500  # of the recording, whose mean directions of gravity are compared
-_TURNED, _OFTEN = np.radians(20.0), 0.2  # from the longest piece's, and how often that makes a recording of stands
 
 
 @dataclass(frozen=True)
@@ -62,20 +62,14 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
         )
     try:
         findings = screen(source.samples)
-        moving = next((finding for finding in findings if finding.kind == "moving"), None)
-        if moving is not None:
-            raise BadInputError(moving.text)
-        pieces = clean(source.samples, findings)
-        _refuse_turned(source.samples, pieces)
-        if not options.cut:
-            pieces = clean(source.samples, [finding for finding in findings if finding.kind == "gap"])
+        refuse_no_rest(source.samples, findings)
+        pieces = clean(source.samples, findings if options.cut else [finding for finding in findings if finding.kind == "gap"])
         rate = rate_hz(np.concatenate([piece.t_ns for piece in pieces]))  # in order, each sample once
         fitted = _fit(pieces, rate, progress)
     except BadInputError as error:
         raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {error}") from None
-    axes = [
-        axis for sensor, has in (("gyro", source.samples.has_gyro), ("accel", source.samples.has_accel)) if has for axis in AXES[sensor]
-    ]
+    has = {"gyro": source.samples.has_gyro, "accel": source.samples.has_accel}
+    axes = [axis for axis in IMU_AXES if has[axis[:-2]]]
     noise = dict(zip(axes, fitted, strict=True))
     longest = max(pieces, key=lambda piece: len(piece.t_ns))
     curve = _deviation(longest, rate, "overlapping", options.exact)
@@ -89,19 +83,6 @@ def allan(sources: Sequence[Path], outputs: Outputs | None = None, options: Opti
     shown = curve if options.kind == "overlapping" else _deviation(longest, rate, options.kind, options.exact)
     write_atomic(options.table, _csv(shown, axes), outputs.force)
     return replace(saved, files=(*saved.files, options.table))
-
-
-def _refuse_turned(samples: ImuSamples, pieces: Sequence[ImuSamples]) -> None:
-    """Raise BadInputError where no axis ever changes, or gravity points elsewhere for much of the time than in the longest piece."""
-    if not any(np.ptp(array, axis=0).any() for array in (samples.gyro, samples.accel) if array.size):
-        raise BadInputError("no axis ever changes: the driver does not fill it, or every sample is the same")
-    if not samples.has_accel:
-        return
-    parts = np.array([part.mean(axis=0) for part in np.array_split(samples.accel, min(len(samples.t_ns), _PARTS))])
-    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-12)
-    at_rest = max(pieces, key=lambda piece: len(piece.t_ns)).accel.mean(axis=0)
-    if np.mean(parts @ at_rest < np.cos(_TURNED) * np.linalg.norm(at_rest)) > _OFTEN:
-        raise BadInputError("it was put down in several attitudes: that is a recording for calibkit imu; leave it in one for hours")
 
 
 def _fit(pieces: Sequence[ImuSamples], rate: float, progress: Progress) -> list[AxisNoise]:
@@ -140,5 +121,6 @@ def _told(options: Options) -> dict[str, str | float | int | bool | None]:
         "gyro_unit": reading.gyro_unit,
         "accel_unit": reading.accel_unit,
         "kind": options.kind,
+        "exact": options.exact,
         "cut": options.cut,
     }

@@ -1,0 +1,48 @@
+"""Options that stages have in common, and the outputs that they name."""
+
+import shlex
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calibkit.stages.outputs import Outputs
+
+Imu = Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")]
+Out = Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")]
+Rigs = Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add the result to; repeatable.")]
+Report = Annotated[Path | None, typer.Option("--report", metavar="DIR", help="Write the report (HTML, pictures, JSON) here.")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Samples per second of an IMU's file without times.")]
+GyroUnit = Annotated[
+    str | None,
+    typer.Option("--gyro-unit", help="Unit of an IMU's file that does not say it: rad/s, deg/s, counts, ... [default: rad/s]"),
+]
+AccelUnit = Annotated[
+    str | None,
+    typer.Option("--accel-unit", help="Unit of an IMU's file that does not say it: m/s^2, g, counts, ... [default: m/s^2]"),
+]
+RosDistro = Annotated[str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")]
+
+
+def outputs_of(
+    inputs: Iterable[Path],
+    out: Path | None,
+    report: Path | None,
+    json_file: Path | None,
+    rigs: list[Path] | None,
+    force: bool,
+    others: Iterable[Path | None] = (),
+) -> "Outputs":
+    """Return a stage's outputs; BadInputError where one of them, or of `others`, is an input or another output."""
+    from calibkit.cli.paths import refuse_clashes
+    from calibkit.stages.outputs import Outputs
+
+    refuse_clashes(inputs, [out, report, json_file, *others])
+    refuse_clashes(rigs or (), [report, json_file, *others])  # OUT may be a rig: it is then updated
+    return Outputs(out, report, json_file, tuple(rigs or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))

@@ -1,9 +1,13 @@
 """Fixtures for all tests: where the real recordings are, and how many tests went without them."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
+from commands import Run, Said
+
+from calibkit.cli.main import main
 
 
 @pytest.fixture
@@ -19,6 +23,20 @@ def data_dir(request: pytest.FixtureRequest) -> Path:
 def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the tests away from the user's corner cache."""
     monkeypatch.setenv("CALIBKIT_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Return a function that runs the command line in this process."""
+
+    def calibkit(*arguments: object) -> Said:
+        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        return Said(int(end.value.code or 0), said.out, said.err)
+
+    return calibkit
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

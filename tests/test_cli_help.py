@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import typer
+from commands import Run
 
 from calibkit.cli import main as cli
 from calibkit.errors import BadInputError, NotConvergedError
@@ -58,23 +59,6 @@ def test_help_takes_less_than_300_ms() -> None:
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     assert min(seconds) < 0.3
-
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Return a function that runs the command line in this process: exit code, stdout, stderr."""
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["calibkit", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out, err = capsys.readouterr()
-        return int(end.value.code or 0), out, err
-
-    return call
 
 
 Raise = Callable[[BaseException], None]

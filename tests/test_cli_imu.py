@@ -1,16 +1,15 @@
 """`calibkit imu` from the command line: stands in, scale and axes out, and one line for every mistake."""
 
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Run
 from numpy.typing import NDArray
 
-from calibkit.cli.main import main
-from calibkit.data.rig import ImuIntrinsics
+from calibkit.data.rig import Estimate, ImuIntrinsics
 from calibkit.data.verdict import Status, Verdict
 from calibkit.geometry import so3
 from calibkit.io.rig_file import load_rig
@@ -27,37 +26,6 @@ ODD = ImuModel(
     C_g_i=so3.exp(np.array([0.004, -0.006, 0.008])),
     b_g=np.array([0.01, -0.02, 0.015]),
 )
-
-
-@dataclass(frozen=True)
-class Said:
-    """How a run ended."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def mistake(self) -> str:
-        """The one line of an error that wrote nothing."""
-        lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
-        assert (self.code, self.out, len(lines)) == (2, "", 1), self
-        return lines[0].removeprefix("calibkit: ")
-
-
-Run = Callable[..., Said]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    def calibkit(*arguments: object) -> Said:
-        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = capsys.readouterr()
-        return Said(int(end.value.code or 0), said.out, said.err)
-
-    return calibkit
 
 
 def write(path: Path, made: MultiPosition, most: int | None = None) -> Path:
@@ -82,16 +50,20 @@ def intrinsics(path: Path) -> ImuIntrinsics:
     return found
 
 
+def assert_near(parameters: dict[str, Estimate], truth: dict[str, float], names: Iterable[str], sigmas: float = 4.5) -> None:
+    for name in names:
+        estimate = parameters[name]
+        assert estimate.value is not None, name
+        assert estimate.sigma is not None, name
+        assert abs(estimate.value - truth[name]) < sigmas * estimate.sigma, name
+
+
 def test_stands_in_scale_and_axes_out(run: Run, recording: Path, made: MultiPosition, tmp_path: Path) -> None:
     said = run("imu", recording, "--gravity", G, "-o", tmp_path / "rig.yaml", "--report", tmp_path / "report")
     assert said.code == 0, said
     found = intrinsics(tmp_path / "rig.yaml")
-    truth = made.model.values()
-    for name, estimate in found.parameters.items():
-        assert estimate.status is Status.DETERMINED
-        assert estimate.value is not None
-        assert estimate.sigma is not None
-        assert abs(estimate.value - truth[name]) < 4.5 * estimate.sigma, name
+    assert {estimate.status for estimate in found.parameters.values()} == {Status.DETERMINED}
+    assert_near(found.parameters, made.model.values(), found.parameters)
     assert found.verdict is Verdict.PASS
     assert found.correction in said.out
     assert {path.name for path in (tmp_path / "report").iterdir()} == {"imu0-imu-stands.png", "report.html", "report.json"}
@@ -116,24 +88,23 @@ def test_raw_counts_in_two_files(run: Run, tmp_path: Path) -> None:
     found = intrinsics(tmp_path / "rig.yaml")
     assert found.unit == "counts"
     assert found.parameters["M_a_xx"].unit == "counts/(m/s^2)"
-    truth = made.model.values()
-    for name in ("M_a_xx", "M_a_zy", "b_a_z", "M_g_zz", "b_g_x"):
-        estimate = found.parameters[name]
-        assert estimate.value == pytest.approx(truth[name], abs=4.5 * (estimate.sigma or 0)), name
+    assert_near(found.parameters, made.model.values(), ("M_a_xx", "M_a_zy", "b_a_z", "M_g_zz", "b_g_x"))
     assert "raw counts" in run("allan", tmp_path / "acc.txt", tmp_path / "gyro.txt", *units).mistake
 
 
 def test_gravity_that_is_not_given_is_in_the_scales_sigma(run: Run, recording: Path, tmp_path: Path) -> None:
-    sigmas = {}
+    scale = {}
     for name, options in (("given", ("--gravity", G)), ("place", ("--latitude", 47.4, "--altitude", 400)), ("none", ())):
         run("imu", recording, *options, "-o", tmp_path / f"{name}.yaml")
-        sigmas[name] = intrinsics(tmp_path / f"{name}.yaml").parameters["M_a_xx"].sigma
-    assert sigmas["given"] < sigmas["place"] < sigmas["none"]
-    plain = intrinsics(tmp_path / "none.yaml").parameters["M_a_xx"].sigma_plain
-    assert sigmas["none"] == pytest.approx(plain, rel=0.02)  # or the factor between them would speak of residuals, and be gravity's
-    assert sigmas["none"] == pytest.approx(1.01 * STANDARD_GRAVITY.sigma / STANDARD_GRAVITY.value, rel=0.1)
-    # Zurich's gravity is 9.8067 (Swiss gravity net 9.80648); the equator's and the pole's normal gravity are WGS 84's own
-    assert gravity_at(47.4, 400).value == pytest.approx(9.8067, abs=1e-3)
+        scale[name] = intrinsics(tmp_path / f"{name}.yaml").parameters["M_a_xx"]
+    alone, alone_plain = scale["given"].sigma, scale["given"].sigma_plain
+    for name, gravity in (("place", gravity_at(47.4, 400)), ("none", STANDARD_GRAVITY)):
+        # M goes as 1 / g, and so do the sigmas without gravity's share: these g differ from G by 3.4e-4 of it
+        share = scale[name].value * gravity.sigma / gravity.value
+        assert scale[name].sigma == pytest.approx(np.hypot(alone, share), rel=1e-3)
+        assert scale[name].sigma_plain == pytest.approx(np.hypot(alone_plain, share), rel=1e-3)  # the factor speaks of residuals only
+    # WGS 84's own normal gravity at the equator and the pole; the free-air gradient above them
+    assert gravity_at(47.4, 400).value - gravity_at(47.4, 0).value == pytest.approx(-3.086e-6 * 400, abs=1e-12)
     assert gravity_at(0, 0).value == pytest.approx(9.7803253359, abs=1e-9)
     assert gravity_at(-90, 0).value == pytest.approx(9.8321849378, abs=1e-9)
     assert "give one of them" in run("imu", recording, "--gravity", G, "--latitude", 47).mistake
@@ -210,12 +181,9 @@ def test_a_turntable_tells_the_gyroscopes_scale(run: Run, made: MultiPosition, t
     said = run("imu", *common, "--turntable", rates, "-o", tmp_path / "with.yaml")
     assert said.code == 0, said
     without, found = intrinsics(tmp_path / "without.yaml").parameters, intrinsics(tmp_path / "with.yaml").parameters
-    truth = made.model.values()
-    for name in ("M_g_xx", "M_g_yx", "M_g_yy", "M_g_zx", "M_g_zy", "M_g_zz", "phi_g_i_z", "M_a_xx"):
-        sigma, value = found[name].sigma, found[name].value
-        assert sigma is not None
-        assert value == pytest.approx(truth[name], abs=4.5 * sigma), name
-        assert sigma <= without[name].sigma
+    told = ("M_g_xx", "M_g_yx", "M_g_yy", "M_g_zx", "M_g_zy", "M_g_zz", "phi_g_i_z", "M_a_xx")
+    assert_near(found, made.model.values(), told)
+    assert all(found[name].sigma <= without[name].sigma for name in told)
     assert "disagree" not in said.out
     twice = table_rates(tmp_path / "twice.csv", list(zip(begins, axes, strict=True)), unit="rad/s")
     twice.write_text(twice.read_text().replace("[rad/s]", "[deg/s]"))  # rates 57 times too small
@@ -233,8 +201,7 @@ def test_a_turntable_alone_tells_no_accelerometer(run: Run, tmp_path: Path) -> N
     found = intrinsics(tmp_path / "rig.yaml").parameters
     assert found["M_a_xx"].value is None
     assert found["phi_g_i_x"].value is None
-    for name in ("M_g_xx", "M_g_zy", "M_g_zz"):
-        assert found[name].value == pytest.approx(ODD.values()[name], abs=4.5 * (found[name].sigma or 0))
+    assert_near(found, ODD.values(), ("M_g_xx", "M_g_zy", "M_g_zz"))
     assert run("report", tmp_path / "rig.yaml").code == 1
     late = table_rates(tmp_path / "late.csv", [(begin + 1000, n) for begin, n in zip(begins, axes, strict=True)])
     assert "on the IMU's clock" in run("imu", tmp_path / "table.csv", "--turntable", late).mistake

@@ -3,16 +3,15 @@
 import hashlib
 import json
 import shutil
-import sys
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from commands import Run
 from rigs import full_rig
 
-from calibkit.cli.main import main
 from calibkit.data.observations import BoardViews
 from calibkit.data.rig import Camera, Rig
 from calibkit.data.verdict import Status
@@ -36,33 +35,9 @@ START_S = 1_700_000_000
 TARGET = "target_type: aprilgrid\ntagCols: 4\ntagRows: 4\ntagSize: 0.12\ntagSpacing: 0.3\n"
 
 
-@dataclass(frozen=True)
-class Said:
-    """How a run ended."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def mistake(self) -> str:
-        """The one line of an error that wrote nothing."""
-        lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
-        assert (self.code, self.out, len(lines)) == (2, "", 1), self
-        assert lines[0].startswith("calibkit: ")
-        return lines[0]
-
-
 @pytest.fixture
-def run(monkeypatch, capsys):
-    def calibkit(*arguments: object) -> Said:
-        monkeypatch.setattr(sys, "argv", ["calibkit", "intrinsics", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = capsys.readouterr()
-        return Said(int(end.value.code or 0), said.out, said.err)
-
-    return calibkit
+def run(run: Run) -> Run:
+    return partial(run, "intrinsics")
 
 
 @pytest.fixture

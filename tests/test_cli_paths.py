@@ -3,24 +3,16 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from calibkit.cli.main import main
+from commands import Run
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def run(*arguments: object) -> str:
-        monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = capsys.readouterr()
-        assert (end.value.code, said.out, len(said.err.splitlines())) == (2, "", 1), said
-        return said.err
-
-    return run
+def refused(run: Run) -> Callable[..., str]:
+    return lambda *arguments: run(*arguments).mistake
 
 
 @pytest.mark.parametrize(
@@ -55,7 +47,7 @@ def test_an_output_over_an_input_or_another_output_is_refused(words, what, refus
 
 @pytest.mark.parametrize("words", [["info", ""], ["intrinsics", "a", "--target", ""], ["import", "a", "-o", ""], ["info", "--", ""]])
 def test_an_empty_argument_is_an_unset_variable_and_not_this_folder(words, refused) -> None:
-    assert refused(*words) == "calibkit: an argument is empty: is a variable of the shell unset?\n"
+    assert refused(*words) == "an argument is empty: is a variable of the shell unset?"
 
 
 def test_an_error_of_the_system_comes_with_a_remedy(refused) -> None:
@@ -78,10 +70,8 @@ def test_a_log_without_greek_letters_is_no_error(encoding: str) -> None:
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, b"? ?", b"")
 
 
-def test_h_is_help_everywhere(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_h_is_help_everywhere(run: Run) -> None:
     for words in (["-h"], ["info", "-h"], ["target", "aprilgrid", "-h"]):
-        monkeypatch.setattr(sys, "argv", ["calibkit", *words])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert end.value.code == 0
-        assert "--help" in capsys.readouterr().out
+        said = run(*words)
+        assert said.code == 0
+        assert "--help" in said.out

@@ -1,25 +1,17 @@
 """`calibkit import` and `export` on the command line, and cameras that a format cannot hold."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from commands import Run
 from rigs import LENSES, SIZES, camera, full_rig
 
-from calibkit.cli import main as cli
 from calibkit.data.rig import Rig
 from calibkit.estimation.model_conversion import convert, nearest
 from calibkit.io.rig_file import load_rig, save_rig
 from calibkit.models.cameras import CAMERAS
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["calibkit", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -56,52 +48,46 @@ def test_what_a_pinhole_cannot_see_counts_as_lost() -> None:
     assert found.lost > 0.2
 
 
-def test_a_lossy_export_is_refused_unless_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lossy_export_is_refused_unless_asked_for(run: Run, tmp_path: Path) -> None:
     save_rig(Rig(cameras={"cam0": camera("pinhole-radtan5")}), tmp_path / "rig.yaml")
     export = ("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "out")
-    assert command(monkeypatch, *export) == 2
-    message = capsys.readouterr().err
+    message = run(*export).mistake
     assert "cam0: kalibr would hold pinhole-" in message
     assert "instead of pinhole-radtan5, off by at most " in message
-    assert message.rstrip().endswith("or pass --lossy")
+    assert message.endswith("or pass --lossy")
     assert not (tmp_path / "out").exists()
-    assert command(monkeypatch, *export, "--lossy") == 0
-    out = capsys.readouterr()
-    assert "note: cam0: written as pinhole-" in out.err
-    assert out.out == f"written: {tmp_path / 'out' / 'camchain.yaml'}\n"
+    said = run(*export, "--lossy")
+    assert "note: cam0: written as pinhole-" in said.err
+    assert (said.code, said.out) == (0, f"written: {tmp_path / 'out' / 'camchain.yaml'}\n")
 
 
-def test_a_conversion_below_a_tenth_of_a_pixel_is_said_and_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_conversion_below_a_tenth_of_a_pixel_is_said_and_done(run: Run, tmp_path: Path) -> None:
     entry = camera("pinhole-radtan5")
     near = entry.model_copy(update={"covariance": None, "parameters": {**entry.parameters, "k3": entry.parameters["p1"]}})  # k3 = 1e-4
     save_rig(Rig(cameras={"cam0": near}), tmp_path / "rig.yaml")
-    assert command(monkeypatch, "export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "out") == 0
-    assert "note: cam0: written as pinhole-radtan instead of pinhole-radtan5, off by at most 0.0" in capsys.readouterr().err
+    said = run("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", tmp_path / "out")
+    assert said.code == 0
+    assert "note: cam0: written as pinhole-radtan instead of pinhole-radtan5, off by at most 0.0" in said.err
     assert yaml.safe_load((tmp_path / "out" / "camchain.yaml").read_text())["cam0"]["distortion_model"] == "radtan"
 
 
-def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_manners(run: Run, tmp_path: Path) -> None:
     save_rig(full_rig(), tmp_path / "rig.yaml")
     out = tmp_path / "out"
     export = ("export", tmp_path / "rig.yaml", "--to", "kalibr", "-o", out)
-    assert command(monkeypatch, *export) == 0
-    assert command(monkeypatch, *export) == 2
-    assert "--force" in capsys.readouterr().err
-    assert command(monkeypatch, *export, "--force") == 0
+    assert run(*export).code == 0
+    assert "--force" in run(*export).mistake
+    assert run(*export, "--force").code == 0
     bring = ("import", *sorted(out.iterdir()), "-o", tmp_path / "new.yaml")
-    assert command(monkeypatch, *bring) == 0
-    assert capsys.readouterr().out.endswith(f"cameras 2, IMUs 2, transforms 4, time offsets 2 written to {tmp_path / 'new.yaml'}\n")
-    assert command(monkeypatch, *bring) == 2
-    run = load_rig(tmp_path / "new.yaml").provenance[0]
-    assert run.stage == "import"
-    assert run.command.startswith("calibkit import ")
-    assert [entry.name for entry in run.inputs] == ["camchain.yaml", "imu.yaml", "imu1.yaml"]
-    assert all(entry.sha256 for entry in run.inputs)
-    capsys.readouterr()
+    said = run(*bring)
+    assert said.code == 0
+    assert said.out.endswith(f"cameras 2, IMUs 2, transforms 4, time offsets 2 written to {tmp_path / 'new.yaml'}\n")
+    assert run(*bring).code == 2
+    made = load_rig(tmp_path / "new.yaml").provenance[0]
+    assert made.stage == "import"
+    assert made.command.startswith("calibkit import ")
+    assert [entry.name for entry in made.inputs] == ["camchain.yaml", "imu.yaml", "imu1.yaml"]
+    assert all(entry.sha256 for entry in made.inputs)
     for arguments, words in [
         (("export", tmp_path / "rig.yaml", "--to", "vinyl", "-o", out), "--to vinyl: no such format; choose one of kalibr, ros, opencv"),
         (("export", tmp_path / "absent.yaml", "--to", "ros", "-o", out), "absent.yaml: cannot be read"),
@@ -111,20 +97,14 @@ def test_the_commands_manners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
         (("import", out, "-o", tmp_path / "x.yaml"), "out: is not a file"),
         (("import", out / "imu.yaml", out / "imu.yaml", "-o", out / "no" / "x.yaml"), "there is no folder"),
     ]:
-        assert command(monkeypatch, *arguments) == 2
-        message = capsys.readouterr().err
-        assert words in message
-        assert message.count("\n") == 1
+        assert words in run(*arguments).mistake
     assert not (tmp_path / "x.yaml").exists()
 
 
-def test_an_export_never_replaces_the_rig_that_it_comes_from(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_export_never_replaces_the_rig_that_it_comes_from(run: Run, tmp_path: Path) -> None:
     rig = tmp_path / "camchain.yaml"
     save_rig(full_rig(), rig)
     before = rig.read_bytes()
-    assert command(monkeypatch, "export", rig, "--to", "kalibr", "-o", tmp_path, "--force") == 2
-    assert "camchain.yaml: is the rig file that is exported" in capsys.readouterr().err
+    assert "camchain.yaml: is the rig file that is exported" in run("export", rig, "--to", "kalibr", "-o", tmp_path, "--force").mistake
     assert rig.read_bytes() == before
-    assert command(monkeypatch, "export", rig, "--to", "kalibr", "-o", tmp_path / "new" / "folder") == 0
+    assert run("export", rig, "--to", "kalibr", "-o", tmp_path / "new" / "folder").code == 0

@@ -1,6 +1,5 @@
 """Scenarios, faults and the simulate stage: geometry and clocks agree with each other, faults do what they say, files are whole."""
 
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
+from commands import Run
 
-from calibkit.cli.main import main
 from calibkit.data.transforms import find_transform
 from calibkit.errors import BadInputError
 from calibkit.geometry import se3
@@ -233,29 +232,20 @@ def test_force_replaces_an_earlier_recording_and_nothing_else(tmp_path: Path) ->
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def calibkit(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["calibkit", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = capsys.readouterr()
-        return int(end.value.code or 0), said.out, said.err
-
-    code, out, err = calibkit("simulate", "--list")
+def test_the_command(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("simulate", "--list")
     assert (code, err) == (0, "")
     assert all(f"  {name} " in out for name in (*SCENARIOS, *FAULTS))
 
     folder = tmp_path / "out"
-    code, out, err = calibkit("simulate", "cam-imu", "-o", str(folder), "--duration", "1", "--format", "mcap", "--fault", "image-late")
+    code, out, err = run("simulate", "cam-imu", "-o", folder, "--duration", "1", "--format", "mcap", "--fault", "image-late")
     assert (code, err) == (0, "")
     assert out.splitlines()[0] == "images: 10 of /cam0/image_raw"
     assert sorted(f.name for f in folder.iterdir()) == ["cam_imu", "target.yaml", "truth.yaml"]
 
     for arguments, line in [
-        (("simulate", "cam-imu", "-o", str(folder)), "calibkit: "),
-        (("simulate", "cam-imu"), "calibkit: simulate needs a scenario and a folder"),
-        (("simulate", "[red]no", "-o", "x"), "calibkit: there is no scenario [red]no"),
+        (("simulate", "cam-imu", "-o", folder), f"{folder}: has something in it"),
+        (("simulate", "cam-imu"), "simulate needs a scenario and a folder"),
+        (("simulate", "[red]no", "-o", "x"), "there is no scenario [red]no"),
     ]:
-        code, out, err = calibkit(*arguments)
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert err.startswith(line)
+        assert run(*arguments).mistake.startswith(line)

@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -181,6 +182,20 @@ def test_a_dead_sensor_is_told_and_drawn_without(run: Run, tmp_path: Path) -> No
     assert said.code == 3, said
     assert "gyro_x white, gyro_x flicker and gyro_x walk are not observable: every sample has the same value" in said.out
     assert (report / "imu0-allan-allan.png").exists()
+
+
+def test_a_density_of_fewer_than_three_axes_names_them(run: Run, tmp_path: Path) -> None:
+    samples = rest(600)
+    samples[:, :2] = simulate_noise(replace(GYRO, walk=1e-4), len(samples), RATE, np.random.default_rng(1), 2)
+    samples[:, 5] = 0
+    said = run("allan", write(tmp_path / "imu.csv", samples), "-o", tmp_path / "rig.yaml")
+    assert "CHECK imu0: gyro_random_walk rests on x and y only: the recording does not tell K of z\n" in said.out
+    assert "CHECK imu0: accel_noise_density rests on x and y only: the recording does not tell N of z\n" in said.out
+    assert said.out.count(" rests on ") == 2  # of no K of the accelerometer, and of all N of the gyroscope
+    imu = load_rig(tmp_path / "rig.yaml").imus["imu0"]
+    assert imu.gyro_random_walk is not None
+    assert imu.gyro_random_walk.value == pytest.approx(np.sqrt(np.mean([imu.noise[axis].walk.value ** 2 for axis in ("gyro_x", "gyro_y")])))
+    assert "gyro_random_walk rests on x and y only" in run("report", tmp_path / "rig.yaml").out
 
 
 @pytest.mark.parametrize("name", ["\u00fc0", "a" * 41, "0imu", ""])

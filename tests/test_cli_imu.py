@@ -1,8 +1,9 @@
 """`calibkit imu` from the command line: stands in, scale and axes out, and one line for every mistake."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ from calibkit.data.rig import Estimate, ImuIntrinsics
 from calibkit.data.verdict import Status, Verdict
 from calibkit.geometry import so3
 from calibkit.io.rig_file import load_rig
-from calibkit.models.imu import STANDARD_GRAVITY, ImuModel, gravity_at
+from calibkit.models.imu import STANDARD_GRAVITY, Gravity, ImuModel, gravity_at
 from calibkit.simulation.multi_position import MultiPosition, MultiPositionPlan, simulate_multi_position
+from calibkit.stages.imu import Options
+from calibkit.stages.imu import imu as calibrate
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 
 G = 9.81
@@ -73,6 +77,21 @@ def test_stands_in_scale_and_axes_out(run: Run, recording: Path, made: MultiPosi
     np.testing.assert_allclose(a, force, atol=0.01)
     np.testing.assert_allclose(w, omega, atol=0.005)
     assert run("report", tmp_path / "rig.yaml").code == 0
+
+
+def test_the_fits_are_counted_while_they_run(recording: Path) -> None:
+    counted: dict[str, tuple[int, int | None]] = {}
+
+    def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
+        for k, item in enumerate(items, 1):
+            counted[what] = (k, total)
+            yield item
+
+    loud = calibrate([recording], options=Options(gravity=Gravity(G, 0.0, "given")), progress=progress)
+    fits, total = counted["fits to the stands"]
+    assert fits >= 3  # the first, a robust one, the last
+    assert total is None  # it hangs on what is left out
+    assert loud.result.rig == calibrate([recording], options=Options(gravity=Gravity(G, 0.0, "given"))).result.rig
 
 
 def test_raw_counts_in_two_files(run: Run, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from calibkit.geometry import se3, so3
 from calibkit.opencv import cv2
 from calibkit.report.page import build
 from calibkit.report.parameters import number, rows
-from calibkit.report.summary import summarise
+from calibkit.report.summary import summarise, text
 
 EVIL = "<script>alert(1)</script>"
 
@@ -104,6 +104,26 @@ def test_the_schema_is_stable():
     assert {"file": "cam0-intrinsics-field.png", "sensor": "cam0", "key": "field"}.items() <= data["pictures"][1].items()
     assert len(data["frames"]) == 6
     assert json.dumps(data, allow_nan=False)
+
+
+@pytest.mark.parametrize("plain", [None, 0.03])
+def test_columns_that_are_empty_in_every_row_are_left_out(plain):
+    """One row with a plain sigma keeps them."""
+    known = {name: Estimate(value=460.0, sigma=0.045) for name in ("fy", "cx", "cy", "k1", "k2", "p1", "p2")}
+    made = result(thumbnails=0, parameters={"fx": Estimate(value=460.0, sigma=0.045, sigma_plain=plain), **known})
+    summary = summarise(made.rig, [])
+    head, first = (line.split() for line in text(summary).splitlines() if line.startswith(("parameter", "cam0 fx")))
+    page = build(summary)["report.html"].decode()
+    fx = next(line for line in page.splitlines() if "<b>fx</b>" in line)
+    if plain is None:
+        assert head == ["parameter", "value", "sigma", "unit", "status"]
+        assert first == ["cam0", "fx", "460.000", "0.045", "given"]
+        assert (page.count("plain"), page.count("factor"), fx.count("<td")) == (0, 0, 5)
+    else:
+        assert head == ["parameter", "value", "sigma", "plain", "factor", "unit", "status"]
+        assert first == ["cam0", "fx", "460.000", "0.045", "0.030", "1.50", "given"]
+        assert '<td class="n">0.045</td><td class="n">0.030</td><td class="n">1.50</td>' in fx
+        assert '<th class="n">plain sigma</th><th class="n">factor</th>' in page
 
 
 def _nothing_kept(residuals):

@@ -1,5 +1,7 @@
 """From samples to the fitted problem: first guess, robust fit, what is dropped, weights by likelihood, final fit."""
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -7,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from calibkit.data.progress import Progress, silent
 from calibkit.estimation.imu_problem import StandProblem, State, Weights
 from calibkit.estimation.imu_seed import AccelSeed, seed_accel, seed_gyro
 from calibkit.estimation.imu_turns import Turns
@@ -61,19 +64,25 @@ class ImuFit:
     dropped_turns: tuple[tuple[int, int], ...]  # between which stands
 
 
-def fit_imu(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
+def fit_imu(samples: Samples, stands: Stands, sensitivity: bool, progress: Progress = silent) -> ImuFit:
     """Return the joint maximum likelihood estimate; stands and turns that contradict the others by 5 sigma are left out."""
     with threadpool_limits(1, user_api="blas"):  # the matrices are small: threads cost more than they bring
-        return _fit(samples, stands, sensitivity)
+        return deque(progress(_fits(samples, stands, sensitivity), "fits to the stands"), maxlen=1).pop()
 
 
-def _fit(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
+def _fits(samples: Samples, stands: Stands, sensitivity: bool) -> Iterator[ImuFit]:
+    """Yield fit after fit, the last of them the estimate; how many there are hangs on what is left out."""
+
+    def fitted(converged: bool) -> ImuFit:
+        return ImuFit(problem, x, converged, guess, stands, used, why, tuple(sorted(bad_turns)))
+
     guess = _guess(samples, stands)
     why = _restless(stands)
     used = ~np.isin(np.arange(len(stands)), list(why))
     bad_turns: set[tuple[int, int]] = set()
     problem = _problem(samples, stands, guess, used, bad_turns, sensitivity)
     x = _first_fit(problem)
+    yield fitted(False)
     problem = problem.weighted(_robust_weights(problem, x))
     for _ in range(_ROUNDS):
         robust = replace(problem, robust=_ROBUST)
@@ -81,6 +90,7 @@ def _fit(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
         x = minimise(robust, x, tolerance=_ROUGHLY).x
         moved, bad = _outliers(robust, x, np.flatnonzero(used))
         problem = replace(robust, robust=np.inf)
+        yield fitted(False)
         if not moved and not bad:
             break
         why.update(moved)
@@ -91,7 +101,7 @@ def _fit(samples: Samples, stands: Stands, sensitivity: bool) -> ImuFit:
     problem = problem.weighted(find_weights(problem, x))
     solution = minimise(problem, x, tolerance=_EXACTLY)
     x = solution.x
-    return ImuFit(problem, x, solution.converged, guess, stands, used, why, tuple(sorted(bad_turns)))
+    yield fitted(solution.converged)
 
 
 def _guess(samples: Samples, stands: Stands) -> Guess:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.plural import counted
+from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation.imu_fit import ImuFit, Samples, fit_imu
@@ -52,19 +53,21 @@ class ImuCalibration:
         return worst(self.reasons)
 
 
-def calibrate_imu(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool = False, name: str = "imu0") -> ImuCalibration:
+def calibrate_imu(
+    t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool = False, name: str = "imu0", progress: Progress = silent
+) -> ImuCalibration:
     """Return the calibration of samples at t (n,) s; gyro and accel (n, 3) in SI or in counts; gravity in m/s^2.
 
     Samples whose stamp does not come after those before are left out. Biases are the means over the stands. Raises BadInputError
     where there are too few stands to begin with, NotConvergedError where no scale and axes fit them.
     """
     try:
-        return _calibrate(t, gyro, accel, gravity, sensitivity, name)
+        return _calibrate(t, gyro, accel, gravity, sensitivity, name, progress)
     except BadInputError as error:
         raise type(error)(f"{name}: {error}") from None
 
 
-def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool, name: str) -> ImuCalibration:
+def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity: bool, name: str, progress: Progress) -> ImuCalibration:
     if not (np.isfinite(t).all() and np.isfinite(gyro).all() and np.isfinite(accel).all()):
         raise BadInputError("holds values that are not finite: remove those samples from the recording")
     for sensor, values in (("gyroscope", gyro), ("accelerometer", accel)):
@@ -80,7 +83,7 @@ def _calibrate(t: Array, gyro: Array, accel: Array, gravity: float, sensitivity:
     if len(stands) < MIN_STANDS:
         found = f"{counted(len(stands), 'still stand')} in {samples.t[-1]:.0f} s"
         raise NoStandsError(f"only {found}; begin with {STILL_START_S:.0f} s or more at rest, then 12 attitudes, each for 3 s")
-    return _result(fit_imu(samples, stands, sensitivity), gravity, name)
+    return _result(fit_imu(samples, stands, sensitivity, progress), gravity, name)
 
 
 def _result(fit: ImuFit, gravity: float, name: str) -> ImuCalibration:

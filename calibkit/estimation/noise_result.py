@@ -9,10 +9,8 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import IMU_AXES, Estimate, Imu, ImuAxis, Noise, Rig
 from calibkit.data.verdict import Status, Verdict, worst
 from calibkit.estimation.imu_noise import AxisNoise, NoiseTerm, model_deviation
-from calibkit.estimation.noise_verdict import ALWAYS, Rest, duration, of_sensor, reasons_for
+from calibkit.estimation.noise_verdict import ALWAYS, DENSITIES, Rest, duration, of_sensor, reasons_for
 from calibkit.models.noise import LETTERS, UNITS
-
-_DENSITIES = {"white": "noise_density", "walk": "random_walk"}
 
 
 def noise_result(found: Rest, before: Imu, cut: bool) -> Result:
@@ -60,7 +58,7 @@ def _as_noise(axis: ImuAxis, noise: AxisNoise) -> Noise:
 def _densities(found: Rest, noise: dict[ImuAxis, Noise]) -> dict[str, Estimate]:
     """Return Kalibr's four values, one for the three axes: their rms, of the axes that have one."""
     out = {}
-    for sensor, (key, name) in product(UNITS, _DENSITIES.items()):
+    for sensor, (key, name) in product(UNITS, DENSITIES.items()):
         all_axes = [getattr(noise[axis], key) for axis in of_sensor(found, sensor)]
         known = [estimate for estimate in all_axes if estimate.value is not None]
         unit = UNITS[sensor][key]

@@ -13,6 +13,7 @@ from calibkit.estimation.imu_noise import AxisNoise, NoiseTerm
 from calibkit.models.noise import LETTERS, UNITS
 
 ALWAYS = ("white", "flicker", "walk")  # the terms that every axis has; the others show or do not
+DENSITIES = {"white": "noise_density", "walk": "random_walk"}  # Kalibr's name of the one value for a sensor's three axes
 _HARMLESS = ("quantisation", "short_gap")  # kinds of findings that are only told
 _BADLY = 0.1  # relative misfit of the noise model worth a CHECK
 _LOST = 0.1  # share of the recording that is cut out, worth a CHECK
@@ -41,7 +42,7 @@ def of_sensor(found: Rest, sensor: str) -> list[ImuAxis]:
 def reasons_for(found: Rest, cut: bool) -> list[Reason]:
     """Return the reasons of the verdict; `cut` says whether findings were cut out."""
     by_axis = [reason for axis in found.axes for reason in _about_axis(found, axis)]
-    return [*_about_recording(found, cut), *_about_spectra(found), *_about_weak(found), *by_axis]
+    return [*_about_recording(found, cut), *_about_spectra(found), *_about_weak(found), *_about_densities(found), *by_axis]
 
 
 def _about_recording(found: Rest, cut: bool) -> list[Reason]:
@@ -94,6 +95,19 @@ def _about_weak(found: Rest) -> list[Reason]:
         if weak:
             text = f"{key} ({LETTERS[key]}) is weak: 95 % intervals {', '.join(weak)} {UNITS[sensor][key]}; a longer recording tells more"
             out.append(Reason(Verdict.CHECK, f"{found.name}: {sensor} {text}"))
+    return out
+
+
+def _about_densities(found: Rest) -> list[Reason]:
+    """Return which of Kalibr's values rest on some of a sensor's axes only."""
+    out = []
+    for sensor, (key, name) in product(UNITS, DENSITIES.items()):
+        axes = of_sensor(found, sensor)
+        known = [axis[-1] for axis in axes if getattr(found.noise[axis], key).value is not None]
+        if 0 < len(known) < len(axes):
+            unknown = " and ".join(axis[-1] for axis in axes if axis[-1] not in known)
+            text = f"rests on {' and '.join(known)} only: the recording does not tell {LETTERS[key]} of {unknown}"
+            out.append(Reason(Verdict.CHECK, f"{found.name}: {sensor}_{name} {text}"))
     return out
 
 

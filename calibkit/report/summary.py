@@ -32,6 +32,11 @@ class Summary:
     def verdict(self) -> Verdict:
         return worst(self.reasons)
 
+    @property
+    def has_plain(self) -> bool:
+        """Whether the parameters' columns plain and factor hold anything."""
+        return any(row.sigma_plain is not None for row in self.parameters)
+
 
 def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
     """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once."""
@@ -61,7 +66,7 @@ def text(summary: Summary) -> str:
     """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
     told = [*camera_lines(summary), *stage_lines(summary)]
     lines = [*told, ""] if told else []
-    lines += [_table([("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters])]
+    lines += [_parameter_table(summary)]
     if any(row.factor for row in summary.parameters):
         lines.append(f"{sigma_note(summary.rig)}\n")
     if summary.signals:
@@ -145,6 +150,12 @@ def _model_scores(summary: Summary, camera: str) -> list[str]:
             )
             found.append(", ".join(texts) + chosen if texts else "")
     return [text for text in found if text]
+
+
+def _parameter_table(summary: Summary) -> str:
+    """Return the parameters as text; the columns plain and factor only where they hold anything."""
+    cells = [("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters]
+    return _table(cells if summary.has_plain else [(*row[:3], *row[5:]) for row in cells])
 
 
 def _cells(row: Row) -> tuple[str, ...]:

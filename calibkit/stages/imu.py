@@ -50,7 +50,7 @@ def imu(sources: Sequence[Path], outputs: Outputs | None = None, options: Option
     start_ns = int(samples.t_ns[0])
     t = np.asarray((samples.t_ns - start_ns) * 1e-9, np.float64)
     try:
-        found = _calibrate(t, samples, options, source.name)
+        found = _calibrate(t, samples, options, source.name, progress)
     except BadInputError as error:
         raise BadInputError(f"{source.recording.name}: {one_line(source.topic)}: {str(error).removeprefix(f'{source.name}: ')}") from None
     before = base.imus.get(source.name, Imu())
@@ -66,11 +66,11 @@ def imu(sources: Sequence[Path], outputs: Outputs | None = None, options: Option
     return save(result, base, outputs, [*source.recording.inputs(), *tables], told)
 
 
-def _calibrate(t: NDArray[np.float64], samples: ImuSamples, options: Options, name: str) -> ImuCalibration:
+def _calibrate(t: NDArray[np.float64], samples: ImuSamples, options: Options, name: str, progress: Progress) -> ImuCalibration:
     """Return the calibration from stands, from a turntable's rates where they are given, or from both."""
     table = None if options.turntable is None else fit_table(samples, load_turntable(options.turntable))
     try:
-        found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, name)
+        found = calibrate_imu(t, samples.gyro, samples.accel, options.gravity.value, options.sensitivity, name, progress)
     except NoStandsError:
         if table is None:
             raise

@@ -124,6 +124,8 @@ def test_faults_are_as_large_as_they_say() -> None:
     assert 0.8 < len(image["image-drops"]) / len(stamps) < 0.98
     assert np.diff(image["image-gap"]).max() == pytest.approx(3e9, abs=2e8)
     assert np.std(image["image-jitter"] - stamps) == pytest.approx(10e6, rel=0.25)
+    assert 0.6 < len(image["image-drops-30"]) / len(stamps) < 0.8
+    assert np.std(image["image-jitter-2"] - stamps) == pytest.approx(2e6, rel=0.25)
     assert np.all(image["image-late"] - stamps == 5_000_000_000)
     assert sorted(image["image-stamp"] - stamps)[-2:] == [0, 50_000_000]
     assert np.sum(np.diff(image["duplicate-stamps"]) == 0) == len(stamps) // 20
@@ -136,6 +138,17 @@ def test_faults_are_as_large_as_they_say() -> None:
     assert apply_faults(run, ["board-size"]).board_told.tag_size == pytest.approx(0.080)
     assert apply_faults(run, ["tag-spacing"]).board_told.spacing == pytest.approx(0.2)
     assert len(t) == 3000
+
+
+def test_faults_of_the_cameras_clock_change_td_as_they_say() -> None:
+    run = session()
+    true, n = run.tracks[0].t_true_ns, len(run.tracks[0].t_true_ns)
+    seconds = (run.tracks[0].stamp_ns - run.tracks[0].stamp_ns[0]) * 1e-9
+    skewed, stepped = (true - apply_faults(run, [name]).tracks[0].stamp_ns for name in ("image-skew", "image-step"))  # td = t_imu - t_cam
+    assert np.abs(skewed - (5e6 - 50e3 * seconds)).max() <= 1
+    assert np.array_equal(stepped, np.where(np.arange(n) < n / 2, 5_000_000, -28_000_000))
+    for name in ("image-skew", "image-step"):
+        assert true_rig(apply_faults(run, [name]), name).time_offsets["dt_imu0_cam0"].offset.value == 0.005  # before the fault
 
 
 def test_truth_of_a_rig_without_imu_is_told_from_the_first_camera() -> None:

@@ -51,9 +51,17 @@ def _one_stamp_off(track: Track, rng: np.random.Generator) -> Track:
     return replace(track, stamp_ns=stamps)
 
 
-def _jitter(track: Track, rng: np.random.Generator) -> Track:
-    noise = np.round(rng.normal(0, 10e6, len(track.stamp_ns))).astype(np.int64)
-    return replace(track, stamp_ns=track.stamp_ns + noise)
+def _drops(share: float) -> Fault:
+    return _tracks(lambda track, rng: _keep(track, rng.random(len(track.stamp_ns)) > share))
+
+
+def _stamped(late_ns: Callable[[NDArray[np.int64], np.random.Generator], NDArray[np.float64]]) -> Fault:
+    """Return the fault that makes every camera's stamps (f,) late by so many ns; td = t_imu - t_cam falls by as much."""
+    return _tracks(lambda track, rng: replace(track, stamp_ns=track.stamp_ns + np.round(late_ns(track.stamp_ns, rng)).astype(np.int64)))
+
+
+def _jitter(sigma_ns: float) -> Fault:
+    return _stamped(lambda stamps, rng: rng.normal(0, sigma_ns, len(stamps)))
 
 
 def _duplicate_stamps(track: Track, rng: np.random.Generator) -> Track:
@@ -100,18 +108,22 @@ def _tag_spacing(session: Session, rng: np.random.Generator) -> Session:
 
 
 FAULTS: dict[str, tuple[str, Fault]] = {
-    "image-drops": (
-        "a tenth of the images is lost",
-        _tracks(lambda track, rng: _keep(track, rng.random(len(track.stamp_ns)) > 0.1)),
-    ),
+    "image-drops": ("a tenth of the images is lost", _drops(0.1)),
+    "image-drops-30": ("three in ten images are lost", _drops(0.3)),
     "image-gap": (
         "3 s without images",
         _tracks(lambda track, rng: _keep(track, _outside_gap(track.t_true_ns, 3.0))),
     ),
-    "image-jitter": ("image stamps with 10 ms of noise", _tracks(_jitter)),
-    "image-late": (
-        "images stamped 5 s late",
-        _tracks(lambda track, rng: replace(track, stamp_ns=track.stamp_ns + 5_000_000_000)),
+    "image-jitter": ("image stamps with 10 ms of noise", _jitter(10e6)),
+    "image-jitter-2": ("image stamps with 2 ms of noise", _jitter(2e6)),
+    "image-late": ("images stamped 5 s late: td = t_imu - t_cam is 5 s less", _stamped(lambda stamps, rng: np.full(len(stamps), 5e9))),
+    "image-skew": (
+        "the camera's clock is 50 ppm fast: td = t_imu - t_cam is true at the first image and falls by 0.05 ms a second",
+        _stamped(lambda stamps, rng: (stamps - stamps[0]) * 50e-6),
+    ),
+    "image-step": (
+        "image stamps 33 ms late from half-way on: td = t_imu - t_cam falls by 33 ms there",
+        _stamped(lambda stamps, rng: np.where(stamps < (stamps[0] + stamps[-1]) / 2, 0.0, 33e6)),
     ),
     "image-stamp": ("one image stamp 50 ms off", _tracks(_one_stamp_off)),
     "duplicate-stamps": ("one image in twenty repeats the stamp before", _tracks(_duplicate_stamps)),

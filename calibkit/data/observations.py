@@ -137,6 +137,30 @@ class BoardViews:
 
 
 @dataclass(frozen=True)
+class FeatureTracks:
+    """Points of the scene followed through one camera's images: one row where a track is seen in a frame, sorted by frame, then track."""
+
+    camera: str
+    image_size: tuple[int, int]  # width, height px
+    t_ns: Times  # (f,) stamps, increasing
+    labels: tuple[str, ...]  # (f,) what to call each frame: file name or stamp
+    frame: NDArray[np.int32]  # (n,) index into the frames
+    track: NDArray[np.int32]  # (n,) which point it is; a number is never used again
+    uv: Array  # (n, 2) px
+    warnings: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        f, n = len(self.t_ns), len(self.frame)
+        _check("FeatureTracks", t_ns=(self.t_ns, (f,)), frame=(self.frame, (n,)), track=(self.track, (n,)), uv=(self.uv, (n, 2)))
+        if len(self.labels) != f:
+            raise ValueError(f"FeatureTracks has {len(self.labels)} labels for {f} frames")
+        if np.any(np.diff(self.t_ns) <= 0):
+            raise ValueError("FeatureTracks.t_ns must increase")
+        if n and (self.frame[0] < 0 or self.frame[-1] >= f or np.any(np.diff(self.frame.astype(np.int64) << 32 | self.track) <= 0)):
+            raise ValueError("FeatureTracks rows must be sorted by frame, then track, without repeats, with frames in range")
+
+
+@dataclass(frozen=True)
 class ImageFrame:
     """One image of a recording, not yet decoded: many may wait while few are in memory as pixels."""
 

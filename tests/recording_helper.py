@@ -88,6 +88,22 @@ class Make:
             self.header(t_ns, "world"), self.types["geometry_msgs/msg/Pose"](point, self.quaternion(q))
         )
 
+    def twist(self, t_ns: int, rate: Any, frame: str = "base") -> Any:
+        twist = self.types["geometry_msgs/msg/Twist"](self.vector((1, 0, 0)), self.vector(rate))
+        return self.types["geometry_msgs/msg/TwistStamped"](self.header(t_ns, frame), twist)
+
+    def twist_with_covariance(self, t_ns: int, rate: Any) -> Any:
+        twist = self.twist(t_ns, rate)
+        known = self.types["geometry_msgs/msg/TwistWithCovariance"](twist.twist, np.zeros(36))
+        return self.types["geometry_msgs/msg/TwistWithCovarianceStamped"](twist.header, known)
+
+    def odometry(self, t_ns: int, p: Any, q: Any, rate: Any) -> Any:
+        pose, none = self.pose(t_ns, p, q), np.zeros(36)
+        twist = self.types["geometry_msgs/msg/TwistWithCovariance"](self.twist(t_ns, rate).twist, none)
+        return self.types["nav_msgs/msg/Odometry"](
+            self.header(t_ns, "odom"), "base", self.types["geometry_msgs/msg/PoseWithCovariance"](pose.pose, none), twist
+        )
+
     def tf(self, *entries: tuple[int, str, str, Any, Any]) -> Any:
         transforms = [
             self.types["geometry_msgs/msg/TransformStamped"](

@@ -70,6 +70,31 @@ def test_every_format_gives_back_what_was_written(tmp_path: Path, form: str) -> 
     assert recording.warnings == []
 
 
+@pytest.mark.parametrize("form", ["ros1", "mcap", "db3"])
+def test_twists_are_rates_and_an_odometry_is_poses(tmp_path: Path, form: str) -> None:
+    make, rates = Make(form), np.random.default_rng(2).normal(size=(20, 3))
+    messages: list[tuple[str, int, object]] = []
+    for i, rate in enumerate(rates):
+        t = T0 + i * 20_000_000
+        messages.append(("/arm", t + LATENCY, make.twist_with_covariance(t, rate)))
+        messages.append(("/wheels", t + LATENCY, make.twist(t if i != 3 else 0, rate * (0, 0, 1) if i != 5 else (0, 0, np.nan))))
+        messages.append(("/odom", t + LATENCY, make.odometry(t, rate, (0, 0, 0, 1), rate)))
+    recording = open_recording([write(tmp_path, form, messages)])
+    assert {t.name: t.kind for t in recording.topics} == {"/arm": "twist", "/wheels": "twist", "/odom": "pose"}
+    arm = recording.twist("/arm")
+    assert arm.t_ns.tolist() == [T0 + i * 20_000_000 for i in range(20)]
+    np.testing.assert_array_equal(arm.gyro, rates)
+    assert (arm.has_accel, arm.unit) == (False, "SI")
+    wheels = recording.twist("/wheels")
+    np.testing.assert_array_equal(wheels.gyro, np.delete(rates, 5, axis=0) * (0, 0, 1))
+    assert wheels.t_ns[3] == T0 + 60_000_000  # of the record time, on the header's clock
+    assert any("/wheels: 1 rate is not finite" in warning for warning in recording.warnings)
+    assert len(recording.poses("/odom").t_ns) == 20
+    assert recording.survey()["/wheels"].header_ns is not None
+    with pytest.raises(BadInputError, match=r"which twist topic.*choose with --of"):
+        recording.choose("twist")
+
+
 def test_imu_with_frames_of_different_lengths_falls_back(tmp_path: Path) -> None:
     make = Make("db3")
     frames = ["imu", "imu_longer_name", "", "imu"]

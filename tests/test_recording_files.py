@@ -186,6 +186,42 @@ def test_an_odometry_with_rates_is_poses(tmp_path: Path) -> None:
     assert [topic.kind for topic in open_recording([_csv(tmp_path, text)]).topics] == ["pose"]
 
 
+@pytest.mark.parametrize(
+    ("text", "rate"),
+    [
+        ("t,yaw_rate\n1,0.5\n2,nan\n3,-0.25\n", 0.5),
+        ("time [s],v,wz [rad/s]\n1,2,0.5\n3,2,-0.25\n", 0.5),
+        ("# t x y yaw_rate[deg/s]\n1 7 7 90\n3 7 7 -45\n", np.pi / 2),
+    ],
+)
+def test_a_yaw_rate_alone_is_a_twist(text: str, rate: float, tmp_path: Path) -> None:
+    recording = open_recording([_csv(tmp_path, text)])
+    assert [(topic.kind, topic.type) for topic in recording.topics] == [("twist", "yaw rate CSV")]
+    rates = recording.twist("s")
+    assert rates.t_ns.tolist() == [10**9, 3 * 10**9]
+    np.testing.assert_allclose(rates.gyro, [[0, 0, rate], [0, 0, -rate / 2]], rtol=1e-15)
+    assert not rates.has_accel
+    assert len(recording.survey()["s"].record_ns) == recording.topics[0].count
+
+
+def test_a_yaw_rate_in_counts_is_refused_and_beside_an_accelerometer_it_is_none(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="yaw rate is in raw counts"):
+        open_recording([_csv(tmp_path, "t,yaw_rate [lsb]\n1,5\n2,6\n")])
+    recording = open_recording([_csv(tmp_path, "t,ax,ay,az,wz\n1,0,0,9.8,1\n2,0,0,9.8,1\n", "acc.csv")])
+    assert [topic.kind for topic in recording.topics] == ["imu"]
+
+
+def test_tables_of_one_name_are_two_streams(tmp_path: Path) -> None:
+    for place, x in (("a/p.csv", 1), ("b/p.csv", 2), ("other/a/p.txt", 3), ("a/q.csv", 4), ("a/p.tum", 5)):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        _csv((tmp_path / place).parent, f"1 {x} 0 0 0 0 0 1\n", Path(place).name)
+    recording = open_recording([tmp_path / place for place in ("a/p.csv", "b/p.csv", "other/a/p.txt", "a/q.csv")])
+    assert [topic.name for topic in recording.topics] == [f"{tmp_path.name}/a/p", "b/p", "other/a/p", "q"]
+    assert [recording.poses(topic.name).p[0, 0] for topic in recording.topics] == [1, 2, 3, 4]
+    with pytest.raises(BadInputError, match="two files would both be called p: rename one"):
+        open_recording([tmp_path / "a/p.csv", tmp_path / "a/p.tum"])
+
+
 def test_rows_that_are_cut_or_mean_nothing_are_left_out_and_told(tmp_path: Path) -> None:
     text = "t,wx,wy,wz,ax,ay,az\n1,1,2,3,4,5,6\n2,nan,2,3,4,5,6\n3,1,2,3,4,5,6\n4,1,2,3"
     recording = open_recording([_csv(tmp_path, text)])

@@ -116,6 +116,17 @@ def test_pose_streams(data_dir: Path) -> None:
     assert poses.t_ns[0] == 1491754390_480000000
 
 
+def test_two_pose_streams_are_one_recording(data_dir: Path) -> None:
+    recording = open_recording([data_dir / "pose_streams" / name for name in ("vicon_hand.csv", "camera_in_target.csv")])
+    assert [(topic.name, topic.kind) for topic in recording.topics] == [("vicon_hand", "pose"), ("camera_in_target", "pose")]
+    hand, camera = (recording.poses(topic.name) for topic in recording.topics)
+    assert (len(hand.t_ns), len(camera.t_ns)) == (7093, 1533)
+    # As recorded: repeats, gaps and flips of sign are for the estimator.
+    assert np.sum(np.diff(hand.t_ns) == 0) == 5
+    assert np.diff(camera.t_ns).max() == 703_757_100
+    assert np.sum(np.sum(camera.q[1:] * camera.q[:-1], axis=1) < 0) == 18
+
+
 def test_image_folders(data_dir: Path) -> None:
     for folder, count, shape in (("kuka2", 28, (1200, 1920)), ("mei_fisheye", 63, (960, 1280))):
         frames = list(open_recording([data_dir / folder]).images(folder))

@@ -1,4 +1,4 @@
-"""IMU, pose and corner streams in CSV (or TUM's blank-separated) files, recognised by their header or their shape."""
+"""IMU, pose, yaw rate and corner streams in CSV (or TUM's blank-separated) files, recognised by their header or their shape."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calibkit.data.observations import PoseSamples
+from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
-from calibkit.io.imu_options import ImuOptions
+from calibkit.io.imu_options import COUNTS, ImuOptions
 from calibkit.io.imu_text import find_imu, imu_source
-from calibkit.io.ros_bag import unit_poses
+from calibkit.io.ros_bag import rate_samples, unit_poses
 from calibkit.io.source import CornerRows, Look, Source, Stamps, TopicInfo
 from calibkit.io.text_table import ACCEL, GYRO, WANTED, XYZ, Q, TextTable, stem
 
@@ -27,6 +27,8 @@ def csv_source(path: Path, topic: str, options: ImuOptions) -> Source:
         return _corner_source(table, topic, source)
     if table.holds("t", *XYZ, *Q) and not table.holds(*GYRO, *ACCEL):  # with rates beside the poses, it is an odometry and no gyroscope
         return _pose_source(table, topic, source)
+    if table.holds("t", "wz") and not table.columns.keys() & {"wx", "wy", *ACCEL}:
+        return _yaw_source(table, topic, source)
     if held := find_imu(table, options):
         imu_source(table, topic, source, held, options)
         return source
@@ -48,6 +50,22 @@ def _poses(table: TextTable, topic: str, source: Source) -> PoseSamples:
     if lost:
         source.warn(f"{table.name}: {lost} poses have no proper rotation or are not finite, and are left out")
     return samples
+
+
+def _yaw_source(table: TextTable, topic: str, source: Source) -> Source:
+    table.scale("t")
+    table.scale("wz")
+    if table.units["wz"] in COUNTS:
+        raise BadInputError(f"{table.name}: its yaw rate is in raw counts: give it in rad/s or deg/s")
+    source.topics.append(TopicInfo(topic, "yaw rate CSV", "twist", table.count))
+    source.twist[topic] = partial(_yaw_rates, table, source)
+    source.survey = lambda progress, looks: {topic: Stamps(None, table.times())}
+    return source
+
+
+def _yaw_rates(table: TextTable, source: Source) -> ImuSamples:
+    t_ns, rate = table.read("wz")
+    return rate_samples(t_ns, np.hstack([np.zeros((len(rate), 2)), rate]), table.name, source)
 
 
 def _corner_source(table: TextTable, topic: str, source: Source) -> Source:

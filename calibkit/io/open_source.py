@@ -18,15 +18,31 @@ from calibkit.io.text_table import is_table, stem
 
 def open_sources(paths: list[Path], distro: str | None, options: ImuOptions) -> list[Source]:
     """Open all paths; folders and CSV files of one name are told apart by the folders that they lie in."""
-    absolute = [Path(path).absolute() for path in paths]
-    times = Counter(path.name for path in absolute if path.is_dir() or is_table(path))
-    names = [f"{path.parent.name}/{path.name}" if times[path.name] > 1 else path.name for path in absolute]
+    names = _names([Path(path).absolute() for path in paths])
     sources = [
         source for path, name in zip(paths, names, strict=True) for source in _open(Path(path), one_line(name, 120), distro, options)
     ]
     if len(paths) > 1:
         _refuse_repeats(sources)
+        _refuse_one_name([stem(name) for path, name in zip(paths, names, strict=True) if is_table(path)])
     return pair_halves(sources)
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Return the end of each path that is long enough to tell folders and tables apart: what a topic is called has no suffix."""
+    ends = [[stem(path.name) if is_table(path) else path.name, *path.parts[-2::-1]] for path in paths]
+    unclear = [end for path, end in zip(paths, ends, strict=True) if path.is_dir() or is_table(path)]
+    names = []
+    for path, end in zip(paths, ends, strict=True):
+        apart = (depth for depth in range(1, len(path.parts)) if sum(other[:depth] == end[:depth] for other in unclear) < 2)
+        names.append("/".join(path.parts[-next(apart, 1) :]))
+    return names
+
+
+def _refuse_one_name(names: list[str]) -> None:
+    """The rows of two tables of one name would be taken for one stream's."""
+    if repeated := next((name for name, n in Counter(names).items() if n > 1), None):
+        raise BadInputError(f"two files would both be called {one_line(repeated, 120)}: rename one of them")
 
 
 def _refuse_repeats(sources: list[Source]) -> None:

@@ -22,7 +22,13 @@ from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo
 from calibkit.models.board import Board
 
 T = TypeVar("T")
-_OPTIONS = {"image": "--camera", "corners": "--camera", "imu": "--imu"}  # that choose a topic of this kind
+_OPTIONS = {  # that choose a topic of this kind
+    "image": "--camera",
+    "corners": "--camera",
+    "imu": "--imu",
+    "pose": "--of and --to",
+    "twist": "--of and --to",
+}
 
 
 class Recording:
@@ -95,6 +101,10 @@ class Recording:
     def poses(self, topic: str) -> PoseSamples:
         """Return all poses of a topic."""
         return _join([read() for read in self._readers("pose", topic, (source.poses for source in self._sources))])
+
+    def twist(self, topic: str) -> ImuSamples:
+        """Return the rates of turn of a topic as a gyroscope's, in the body's axes; an axis that is 0 throughout is not measured."""
+        return _join_imu([read() for read in self._readers("twist", topic, (source.twist for source in self._sources))], topic)
 
     def tf(self, parent: str, child: str) -> PoseSamples:
         """Return T_parent_child over time, chained through the recording's tf topics."""

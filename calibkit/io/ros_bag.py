@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import images, ros_messages
 from calibkit.io.container import Container, Message
 from calibkit.io.imu_options import ImuOptions
+from calibkit.io.rows import Rows
 from calibkit.io.source import CameraInfo, Edge, Look, Source, Stamps, TopicInfo, seconds_text
 from calibkit.io.topic_pass import TopicPass, plausible, restamp
 from calibkit.io.unpack import UnpackError, unpack_message
@@ -95,6 +97,14 @@ class _Bag:
         if lost:
             self.source.warn(f"{topic}: {lost} poses have no proper rotation or are not finite, and are left out")
         return samples
+
+    def twist(self, topic: str) -> ImuSamples:
+        times, rates = Rows((), np.int64), Rows((3,), np.float64)
+        for t_ns, message in self.decoded(self.stamped(topic), topic):
+            rate = ros_messages.TWISTS[message.__msgtype__](message)
+            times.add(np.array([t_ns], np.int64))
+            rates.add(np.array([[rate.x, rate.y, rate.z]]))
+        return rate_samples(times.take(), rates.take(), topic, self.source)
 
     def camera_info(self, topic: str) -> CameraInfo:
         for _, message in self.decoded(self.stamped(topic), topic):
@@ -178,6 +188,14 @@ def unit_poses(t_ns: NDArray[np.int64], q: Array, p: Array, parent: str, child: 
     return PoseSamples(t_ns[good], q[good] / norm[good, None], p[good], parent, child), int(np.sum(~good))
 
 
+def rate_samples(t_ns: NDArray[np.int64], rates: Array, name: str, source: Source) -> ImuSamples:
+    """Return the rates (n, 3) of a twist as a gyroscope's, without those that are not finite."""
+    good = plausible(rates)
+    if not good.all():
+        source.warn(f"{name}: {counted(int(np.sum(~good)), 'rate is', 'rates are')} not finite and left out")
+    return ImuSamples(t_ns[good], rates[good], np.zeros((int(np.sum(good)), 0)))
+
+
 def _names(topics: Iterable[str]) -> str:
     names = sorted(topics)
     return names[0] if len(names) == 1 else f"{len(names)} topics"
@@ -202,6 +220,7 @@ def bag_source(
         "image": (source.images, bag.images),
         "imu": (source.imu, bag.imu),
         "pose": (source.poses, bag.poses),
+        "twist": (source.twist, bag.twist),
         "camera_info": (source.camera_info, bag.camera_info),
     }
     for (topic, kind_of, encoding), count in sorted(counts.items()):

@@ -62,6 +62,20 @@ POSES: dict[str, Callable[[Any], Pose]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/TransformStamped": transform,
 }
+
+
+def _rates(message: Any) -> Any:
+    return message.twist.angular
+
+
+def _rates_with_covariance(message: Any) -> Any:
+    return message.twist.twist.angular
+
+
+TWISTS: dict[str, Callable[[Any], Any]] = {
+    "geometry_msgs/msg/TwistStamped": _rates,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _rates_with_covariance,
+}
 KINDS = {
     IMAGE: "image",
     COMPRESSED: "image",
@@ -69,6 +83,7 @@ KINDS = {
     CAMERA_INFO: "camera_info",
     "sensor_msgs/msg/PointCloud2": "cloud",
     **dict.fromkeys(POSES, "pose"),
+    **dict.fromkeys(TWISTS, "twist"),
     _TF: "tf",
     _OLD_TF: "tf",
     **dict.fromkeys(_VIDEO, "video"),

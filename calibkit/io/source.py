@@ -15,9 +15,10 @@ Times = NDArray[np.int64]
 
 # What a topic of each kind is good for, as `calibkit info` tells it.
 USES = {
-    "image": "intrinsics (with --target)",
-    "imu": "allan, imu; joint, timeoffset (yet to come)",
-    "pose": "handeye, timeoffset (yet to come)",
+    "image": "intrinsics (with --target), timeoffset",
+    "imu": "allan, imu, timeoffset; joint (yet to come)",
+    "pose": "timeoffset; handeye (yet to come)",
+    "twist": "timeoffset",
     "tf": "handeye, timeoffset (yet to come)",
     "camera_info": "the driver's own calibration, to compare with",
     "corners": "intrinsics (with --target and --resolution)",
@@ -102,6 +103,7 @@ class Source:
     imu: dict[str, Callable[[Progress], ImuSamples]] = field(default_factory=dict)
     part: str = ""  # "gyro" or "accel": an IMU's file that holds this sensor only
     poses: dict[str, Callable[[], PoseSamples]] = field(default_factory=dict)
+    twist: dict[str, Callable[[], ImuSamples]] = field(default_factory=dict)  # rates alone
     camera_info: dict[str, Callable[[], CameraInfo]] = field(default_factory=dict)
     corners: dict[str, Callable[[], CornerRows]] = field(default_factory=dict)
     edges: Callable[[], dict[tuple[str, str], Edge]] | None = None

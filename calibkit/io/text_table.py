@@ -33,7 +33,7 @@ _NAMES = {
     "t": ("t", "ts", "time", "timestamp", "stamp", "#timestamp", "#ts", "#time", "#t"),
     "wx": ("wx", "gx", "w_x", "w_rs_s_x", "gyro_x", "omega_x", "angular_velocity_x"),
     "wy": ("wy", "gy", "w_y", "w_rs_s_y", "gyro_y", "omega_y", "angular_velocity_y"),
-    "wz": ("wz", "gz", "w_z", "w_rs_s_z", "gyro_z", "omega_z", "angular_velocity_z"),
+    "wz": ("wz", "gz", "w_z", "w_rs_s_z", "gyro_z", "omega_z", "angular_velocity_z", "angular_z", "yaw_rate", "yawrate"),
     "ax": ("ax", "a_x", "a_rs_s_x", "accel_x", "acc_x", "linear_acceleration_x"),
     "ay": ("ay", "a_y", "a_rs_s_y", "accel_y", "acc_y", "linear_acceleration_y"),
     "az": ("az", "a_z", "a_rs_s_z", "accel_z", "acc_z", "linear_acceleration_z"),
@@ -69,7 +69,8 @@ _UNITS: dict[str, Mapping[str, float]] = {
 # Columns of files without a header: TUM poses, an IMU as EuRoC has it, the same without times, three axes with and without times.
 _SHAPES = {8: ["t", *XYZ, *Q], 7: ["t", *GYRO, *ACCEL], 6: [*GYRO, *ACCEL], 4: ["t", *XYZ], 3: [*XYZ]}
 WANTED = (
-    "wanted are columns t,wx,wy,wz,ax,ay,az (IMU), t,x,y,z,qx,qy,qz,qw (poses) or timestamp,tag_id,corner_idx,u,v (corners), "
+    "wanted are columns t,wx,wy,wz,ax,ay,az (IMU), t,x,y,z,qx,qy,qz,qw (poses), t,yaw_rate (odometer) or timestamp,tag_id,corner_idx,u,v "
+    "(corners), "
     "named so in a header, the first two also without one"
 )
 

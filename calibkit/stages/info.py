@@ -19,7 +19,7 @@ from calibkit.io.source import Look, Stamps, TopicInfo
 
 _DEFAULT = ImuOptions()
 _SAMPLE = 20  # images of a topic that are decoded and judged
-_TIMED = ("image", "imu", "pose", "camera_info", "corners", "cloud")  # kinds whose times matter
+_TIMED = ("image", "imu", "pose", "twist", "camera_info", "corners", "cloud")  # kinds whose times matter
 
 
 @dataclass(frozen=True)

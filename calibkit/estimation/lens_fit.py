@@ -18,9 +18,9 @@ from calibkit.solver.levenberg_marquardt import minimise
 from calibkit.solver.robust import scale_of_norms
 
 MIN_CORNERS = 6  # a view's pose alone takes six numbers
-_OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
-_NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
-_BAD_VIEW = 6.0  # and one this much noisier is given up
+OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
+NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
+BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
 _POSE_LOSS = 8.0  # px: wide enough to bring a pose in from a far start
 _OUTERMOST = 99.9  # percentile of corners, a stray one left out
@@ -254,15 +254,15 @@ def _judge_views(
         typical = max(float(np.median(scale)), _FINEST)
         if not np.isfinite(typical):
             raise NotConvergedError(f"{views.camera}: {grid.model.name} sees most boards nowhere: try another --model")
-        good = scale <= _BAD_VIEW * typical
-        dropped += [DroppedView(views.camera, views.labels[i], _misfit(scale[i] / typical)) for i in np.flatnonzero(~good)]
-        noisier = np.maximum(scale / (_NOISY_VIEW * typical), 1.0)[good]
+        good = scale <= BAD_VIEW * typical
+        dropped += [DroppedView(views.camera, views.labels[i], misfit(scale[i] / typical)) for i in np.flatnonzero(~good)]
+        noisier = np.maximum(scale / (NOISY_VIEW * typical), 1.0)[good]
         grids.append(replace(rows_of(grid, good), weight=found[c][good] / noisier[:, None]))
         kept.append(good)
     return kept, grids
 
 
-def _misfit(times: float) -> str:
+def misfit(times: float) -> str:
     return f"its corners fit {times:.0f} times worse than usual" if np.isfinite(times) else "no board pose fits its corners"
 
 
@@ -273,6 +273,6 @@ def _give_up_corners(problem: CameraProblem, state: LensState, found: list[Array
         noisier = np.max(np.where(grid.weight > 0, found[c] / np.where(grid.weight > 0, grid.weight, 1.0), 0.0), axis=1, keepdims=True)
         weight = found[c] / np.maximum(noisier, 1.0)
         z, seen = _normalised(problem, state, c, weight)
-        limit = _OUTLIER * max(scale_of_norms(z[seen]), _FINEST)
+        limit = OUTLIER * max(scale_of_norms(z[seen]), _FINEST)
         grids.append(replace(grid, weight=np.where(seen & (z <= limit), weight, 0.0)))
     return replace(problem, cameras=tuple(grids))

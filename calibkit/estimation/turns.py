@@ -5,10 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.observations import Times
+from calibkit.data.observations import ImuSamples, PoseSamples, Times
+from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 Index = NDArray[np.intp]
+
+_LONGEST_NS = 1_000_000_000  # between two stamps; what happened in a longer pause is anyone's guess
+_GAP = 1.75  # median intervals
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,62 @@ class Turns:
     @property
     def duration(self) -> Array:
         """Seconds that each turn took, (n,)."""
-        out: Array = (self.t_ns[self.last] - self.t_ns[self.first]) * 1e-9
-        return out
+        return np.asarray((self.t_ns[self.last] - self.t_ns[self.first]) * 1e-9, np.float64)
 
     @property
     def joined(self) -> NDArray[np.bool_]:
         """Whether each turn starts where the one before it ends, (n,)."""
-        return np.concatenate([[False], self.first[1:] == self.last[:-1]])
+        follows = self.first[1:] == self.last[:-1]
+        return np.concatenate([np.zeros(min(len(self.first), 1), bool), follows])
 
-    def select(self, keep: NDArray[np.generic]) -> "Turns":
-        """Return some of the turns (a mask or increasing indices); stamps stay."""
-        own = None if self.own_cov is None else self.own_cov[keep]
-        return Turns(self.t_ns, self.first[keep], self.last[keep], self.angle[keep], self.end_cov, own, self.axes)
+    def select(self, rows: NDArray[np.generic] | slice) -> "Turns":
+        """Return some of the turns (a mask, increasing indices or a slice), with no more stamps than they need."""
+        first, last = self.first[rows], self.last[rows]
+        start, stop = (int(first[0]), int(last.max()) + 1) if len(first) else (0, 0)
+        end = None if self.end_cov is None else self.end_cov[start:stop]
+        own = None if self.own_cov is None else self.own_cov[rows]
+        return Turns(self.t_ns[start:stop], first - start, last - start, self.angle[rows], end, own, self.axes)
+
+
+def in_order(t_ns: Times) -> Index:
+    """Return the rows in the order of time, of equal stamps the first one only."""
+    order = np.argsort(t_ns, kind="stable")
+    return order[np.concatenate([[True], np.diff(t_ns[order]) > 0])] if len(order) else order
+
+
+def turns_of_poses(poses: PoseSamples) -> Turns:
+    """Return how the poses' child turned from each pose to the next; a pose that repeats the one before to the last digit is none."""
+    order = in_order(poses.t_ns)
+    values = np.concatenate([poses.q, poses.p], axis=1)[order]
+    order = order[np.concatenate([[True], np.any(np.diff(values, axis=0) != 0, axis=1)])] if len(order) else order
+    q = poses.q[order]
+    return turns_of_orientations(poses.t_ns[order], q)
+
+
+def turns_of_gyro(samples: ImuSamples, interval: float = 0.02) -> Turns:
+    """Return how a gyroscope turned over intervals of about `interval` s, bias included; none across gaps."""
+    order = in_order(samples.t_ns)
+    t_ns, rate = samples.t_ns[order], samples.gyro[order]
+    h = np.diff(t_ns)[:, None] * 1e-9
+    typical = float(np.median(h)) if len(h) else interval
+    many = max(1, round(interval / typical))
+    steps = h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12
+    whole = len(steps) // many * many
+    q = so3.quat_exp(steps[:whole]).reshape(-1, many, 4)
+    turned = q[:, 0]
+    for k in range(1, many):
+        turned = so3.quat_multiply(turned, q[:, k])
+    angle = so3.quat_log(turned)
+    stamps = t_ns[: whole + 1 : many]
+    steady = (h[:whole, 0].reshape(-1, many) < _GAP * typical).all(axis=1)
+    first = np.flatnonzero(steady)
+    moving = np.any(samples.gyro != 0, axis=0) if len(samples.gyro) else np.ones(3, bool)
+    return Turns(stamps, first, first + 1, angle[first], axes=(bool(moving[0]), bool(moving[1]), bool(moving[2])))
+
+
+def turns_of_orientations(t_ns: Times, q: Array, end_cov: Array | None = None) -> Turns:
+    """Return the turns between consecutive orientations R_w_s (m, 4) xyzw that are less than a second and three quarters of pi apart."""
+    angle = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[:-1]), q[1:]))
+    near = (np.diff(t_ns) < _LONGEST_NS) & (np.linalg.norm(angle, axis=1) < 0.75 * np.pi)
+    first = np.flatnonzero(near)
+    return Turns(t_ns, first, first + 1, angle[first], end_cov)

@@ -94,6 +94,28 @@ def quat_log(q: Array) -> Array:
     return scale[..., None] * q[..., :3]
 
 
+def quat_exp(v: Array) -> Array:
+    """Return unit quaternions xyzw of rotation vectors, (..., 3) rad -> (..., 4): (sin(a/2) v/a, cos(a/2))."""
+    v = np.asarray(v, float)
+    half2 = np.sum(v * v, axis=-1, keepdims=True) / 4
+    sinc, _ = _sinc_terms(half2)
+    return np.concatenate([sinc / 2 * v, np.cos(np.sqrt(half2))], axis=-1)
+
+
+def quat_multiply(p: Array, q: Array) -> Array:
+    """Return p q, Hamilton's product of quaternions xyzw: the rotation q first, then p; shapes broadcast."""
+    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
+    vector = [d * x + a * w + b * z - c * y, d * y + b * w + c * x - a * z, d * z + c * w + a * y - b * x]
+    product: Array = np.stack([*vector, d * w - a * x - b * y - c * z], axis=-1)
+    return product
+
+
+def quat_conjugate(q: Array) -> Array:
+    """Return the inverse rotation of unit quaternions xyzw."""
+    conjugate: Array = q * np.array([-1.0, -1.0, -1.0, 1.0])
+    return conjugate
+
+
 def log(R: Array) -> Array:
     """Return the rotation vector of R, |v| <= pi, accurate up to pi (through the quaternion), (..., 3, 3) -> (..., 3)."""
     return quat_log(to_quat(R))

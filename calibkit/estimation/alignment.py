@@ -1,0 +1,225 @@
+"""The work on a time offset in rounds: Gauss-Newton on offset, drift and rotation, then the noise's levels, then what is no turn at all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.estimation.clock import Clock
+from calibkit.estimation.orientation_track import OrientationTrack
+from calibkit.estimation.turn_comparison import (
+    LEAST_TURNS,
+    TILT,
+    Stretch,
+    Weighed,
+    linearised,
+    moved,
+    raw_residuals,
+    residual_columns,
+    residuals,
+    weigh,
+    without_rotation,
+)
+from calibkit.estimation.turn_noise import NoiseLevels, estimate_levels
+from calibkit.geometry.so3 import Array
+
+Mask = NDArray[np.bool_]
+
+_ROUNDS = 6
+_OUTLIER = 8.0  # chi-squared a degree of freedom: beyond chance in 100 000 turns of three axes
+_MEDIAN = {1: 0.455, 2: 1.386, 3: 2.366}  # of chi-squared
+_STEPS = 15
+_LONGEST_STEP_S = 0.05
+_WINDOW_STEP_S = 0.002
+_WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
+_SLAB = 2_000_000  # numbers held at once
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The offset of each stretch that tells it alone, the rotation as in the whole."""
+
+    start: Array  # (w,) s of the track's time
+    stop: Array
+    tau: Array  # (w,) s
+    sigma: Array  # (w,) s
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Turns laid against a track with all that may still change."""
+
+    track: OrientationTrack
+    stretches: tuple[Stretch, ...]
+    keep: tuple[Mask, ...]  # of each stretch's turns
+    parts: tuple[Weighed, ...]  # what is kept, weighed
+    levels: NoiseLevels
+    shape: Array  # (3,) variances of the axes relative to each other, where the turns do not say it
+    R: Array  # (d, 3)
+    free_rotation: bool
+    t_ref: float
+    clock: Clock | None
+    c: Array  # (p,) tau at t_ref, then skew and jumps as the clock has them
+    converged: bool = False
+
+    def basis(self, t: Array) -> Array:
+        """Return (m, p): 1, (t - t_ref) where the clock drifts, and a step for each of its jumps."""
+        columns: list[Array] = [np.ones_like(t)]
+        if self.clock is not None:
+            columns += [t - self.t_ref] * bool(self.clock.skew)
+            columns += [(t >= jump.t_s) * 1.0 - float(self.t_ref >= jump.t_s) for jump in self.clock.jumps]
+        return np.stack(columns, axis=1)
+
+    def shift(self, t: Array) -> Array:
+        """Return the offset (m,) at the turns' times t (m,)."""
+        return np.asarray(self.basis(t) @ self.c, np.float64)
+
+    @property
+    def turns(self) -> int:
+        return sum(len(part.stretch.turns.first) for part in self.parts)
+
+
+def weighed(a: Alignment) -> Alignment:
+    """Return the alignment with what it keeps weighed by its levels of noise."""
+    parts = []
+    for stretch, keep in zip(a.stretches, a.keep, strict=True):
+        if keep.sum() >= LEAST_TURNS:
+            kept = Stretch(stretch.turns.select(keep), stretch.origin_ns, stretch.free_bias)
+            parts.append(weigh(kept, kept.noise(a.track, a.R, a.shift(kept.t), a.shape), a.levels))
+    return replace(a, parts=tuple(parts))
+
+
+def settle(a: Alignment, levels: NoiseLevels | None) -> Alignment:
+    """Return the optimum with noise levels of its own (unless given) and without turns that are none."""
+    first = True
+    for _ in range(_ROUNDS):
+        if not first:
+            a = newton(a)
+        kept = _without_outliers(a, robust=first)
+        same = not first and all(np.array_equal(x, y) for x, y in zip(kept, a.keep, strict=True))
+        a = weighed(replace(a, keep=kept))
+        if levels is None:
+            a = weighed(_with_levels(a, jitter=not first))
+        if same:
+            break
+        first = False
+    return newton(a)
+
+
+def _with_levels(a: Alignment, jitter: bool) -> Alignment:
+    """Return the alignment with the axes' relative variances (by medians) and the noise's levels as its residuals have them."""
+    left = [raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[0] for part in a.parts]
+    axes = a.parts[0].stretch.axes
+    median = np.maximum(np.median(np.abs(np.concatenate(left)), axis=0), 1e-12)
+    shape = np.ones(3)
+    shape[axes] = median**2 / np.mean(median**2)
+    noises = [part.stretch.noise(a.track, a.R, a.shift(part.stretch.t), shape) for part in a.parts]
+    return replace(a, shape=shape, levels=estimate_levels(noises, [each.reshape(-1) for each in left], jitter))
+
+
+def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
+    """Return which turns of each stretch are within chance of the fit; before the noise is known, by their median alone."""
+    d = len(a.R)
+    biases = {part.stretch.middle[0]: raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[1] for part in a.parts}
+    squares = []
+    for stretch, keep in zip(a.stretches, a.keep, strict=True):
+        shift = a.shift(stretch.t)
+        turned, _, _ = stretch.beta(a.track, shift[:, None])
+        left = stretch.turns.angle[:, stretch.axes] - turned[:, 0] @ a.R.T
+        own = biases.get(stretch.middle[keep][0]) if keep.any() else None
+        rate = left / stretch.turns.duration[:, None]
+        left = left - stretch.turns.duration[:, None] * (np.median(rate, axis=0) if own is None else own)
+        D = np.tile(np.eye(d), (len(left), 1, 1)) if robust else stretch.noise(a.track, a.R, shift, a.shape).blocks(a.levels, d)
+        squares.append(np.sum(left * np.linalg.solve(D, left[..., None])[..., 0], axis=1))
+    scale = float(np.median(np.concatenate(squares))) / _MEDIAN[d]
+    return tuple(np.asarray(square <= _OUTLIER * d * scale, np.bool_) for square in squares)
+
+
+def newton(a: Alignment) -> Alignment:
+    """Return the alignment at the bottom near it, by Gauss-Newton."""
+    R, c = a.R, a.c
+    free = slice(0, None) if a.free_rotation else slice(3, None)
+    prior = np.zeros(3 + len(c))
+    prior[:3] = 1 / TILT**2
+    for _ in range(_STEPS):
+        at = replace(a, R=R, c=c)
+        H = sum((X.T @ X for X in columns(at)), np.zeros((4 + len(c), 4 + len(c))))
+        A = (H[:-1, :-1] + np.diag(prior))[free, free]
+        scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+        step = np.zeros(3 + len(c))
+        step[free] = scale * np.linalg.lstsq(A * scale[:, None] * scale, H[:-1, -1][free] * scale, rcond=1e-13)[0]
+        far = abs(step[3]) / _LONGEST_STEP_S
+        step /= max(1.0, far)
+        R, c = moved(R, step[:3]), c + step[3:]
+        if step @ (H[:-1, :-1] @ step) < 1e-6 * max(1.0, 0.0) and far < 1:
+            return replace(a, R=R, c=c, converged=True)
+    return replace(a, R=R, c=c, converged=False)
+
+
+def columns(a: Alignment) -> list[Array]:
+    """Return the whitened columns (rows, 3 + p + 1) of every part: rotation, clock, residuals."""
+    return [linearised(part, a.track, a.R, a.shift(part.stretch.t), a.basis(part.stretch.t)) for part in a.parts]
+
+
+def sweep(a: Alignment, tau: Array) -> Array:
+    """Return the V (k,): chi-squared with tau in place of the offset at t_ref, its drift kept, the best rotation and biases at each."""
+    cost, gram = np.zeros(len(tau)), np.zeros((len(tau), 4, 4))
+    for part in a.parts:
+        stretch = part.stretch
+        drift = a.shift(stretch.t) - a.c[0]
+        many = max(1, _SLAB // (16 * len(stretch.t)))
+        for i in range(0, len(tau), many):
+            shift = drift[:, None] + tau[i : i + many]
+            if a.free_rotation:
+                X = np.moveaxis(residual_columns(part, a.track, a.R, shift), 1, 0)
+                gram[i : i + many] += np.swapaxes(X, 1, 2) @ X
+            else:
+                cost[i : i + many] += np.sum(residuals(part, a.track, a.R, shift) ** 2, axis=0)
+    return without_rotation(gram)[0] if a.free_rotation else cost
+
+
+def window_offsets(a: Alignment, reach: float) -> Windows:
+    """Return the offset of each part by itself: the bottom of its own V within `reach`, where it has one, then Gauss-Newton."""
+    found = [_window(a, part, reach) for part in a.parts]
+    rows = np.array([row for row in found if row is not None], float).reshape(-1, 4)
+    return Windows(*(rows[:, k] for k in range(4)))
+
+
+def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, float, float] | None:
+    stretch = part.stretch
+    grid = np.arange(-reach, reach + _WINDOW_STEP_S / 2, _WINDOW_STEP_S)
+    base = a.shift(stretch.t)
+    cost = np.sum(residuals(part, a.track, a.R, base[:, None] + grid) ** 2, axis=0)
+    k = int(np.argmin(cost))
+    if not 0 < k < len(grid) - 1 or min(cost[:k].max(), cost[k + 1 :].max()) - cost[k] < _WINDOW_DEPTH:
+        return None
+    extra, information = float(grid[k]), 0.0
+    ones = np.ones((len(stretch.t), 1))
+    for _ in range(3):
+        X = linearised(part, a.track, a.R, base + extra, ones)[:, 3:]
+        information = float(X[:, 0] @ X[:, 0])
+        extra += float(np.clip(X[:, 0] @ X[:, 1] / max(information, 1e-300), -_WINDOW_STEP_S, _WINDOW_STEP_S))
+    middle = float(stretch.middle.mean())
+    at = float(a.shift(np.array([middle]))[0])
+    return float(stretch.t[0]), float(stretch.t[-1]), at + extra, information**-0.5
+
+
+def epochs(a: Alignment, parts: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Return each turn's information (n, 1, 1) and score (n, 1) of tau with all else eliminated, and its time (n,) s.
+
+    With h = H^-1 e: X h / h_tau is tau's column without what the others explain.
+    """
+    H = sum((X[:, :-1].T @ X[:, :-1] for X in parts), np.zeros((3 + len(a.c), 3 + len(a.c))))
+    H[:3, :3] += np.eye(3) / TILT**2
+    free = np.arange(0 if a.free_rotation else 3, len(H))
+    h = np.zeros(len(H))
+    h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, len(free) - len(a.c)]
+    S, g, t = [], [], []
+    for X, part in zip(parts, a.parts, strict=True):
+        u = X[:, :-1] @ h / h[3]
+        d = len(a.R)
+        S.append(np.sum((u**2).reshape(-1, d), axis=1))
+        g.append(np.sum((u * X[:, -1]).reshape(-1, d), axis=1))
+        t.append(part.stretch.middle)
+    return np.concatenate(S)[:, None, None], np.concatenate(g)[:, None], np.concatenate(t)

@@ -1,0 +1,231 @@
+"""The time offset of two sensors by how they turn: a start at any lag, td over time, the V, and its bottom by maximum likelihood.
+
+t_to = t_of + td: the turns of `of` are looked up at t + td in the orientation track of `to`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibkit.data.observations import ImuSamples, PoseSamples
+from calibkit.errors import BadInputError
+from calibkit.estimation.alignment import Alignment, Windows, columns, epochs, newton, settle, sweep, window_offsets
+from calibkit.estimation.clock import Clock, fit_clock
+from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
+from calibkit.estimation.time_offset_start import Start, find_starts
+from calibkit.estimation.turn_comparison import raw_residuals, split, usable
+from calibkit.estimation.turn_noise import NoiseLevels
+from calibkit.estimation.turns import Turns
+from calibkit.geometry.so3 import Array
+from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
+
+_MAX_REACH_S = 0.8
+_MARGIN_S = 0.01
+_BIAS = 2e-3  # rad/s; a gyroscope's larger bias is taken out of its track, whose turns it bends
+_FEWEST = 20  # turns
+_CHI2_95 = 3.841
+_RIVAL = 10.83  # chi-squared of 1 in 1000: a bottom that is no more than this higher may be the true one
+_RIVAL_SHARE = 0.3  # of the stretches must be known at both lags
+_APART_S = 0.02  # what two starts lead to within is one bottom
+_PROFILE = 41
+_CLOCKS = 2  # times that a clock is looked at anew
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to look."""
+
+    reach_s: float = 0.05
+    step_s: float = 0.0005
+    rotation: Array | None = None  # R_of_to (3, 3), where it is known
+    free_bias: bool = True
+    levels: NoiseLevels | None = None  # None: estimated
+
+
+@dataclass(frozen=True)
+class TimeOffsetFit:
+    """The offset and everything that it is judged by; times in s are on the track's axis, from its origin.
+
+    td = coarse_ns 1e-9 + tau, at the time alignment.t_ref where the clock is not constant.
+    """
+
+    alignment: Alignment
+    start: Start
+    coarse_ns: int
+    covariance: Covariance  # (1, 1) of tau
+    interval: tuple[float, float]  # 95 % by profile likelihood, as tau
+    tau: Array  # (k,) of the V
+    cost: Array  # (k,)
+    second: float | None  # another offset that fits nearly as well, s
+    windows: Windows
+    clock: Clock | None
+    gyro_bias: Array  # (3,) rad/s in the track's axes: the mean of what the stretches found
+    n_turns: int  # in the overlap
+
+    @property
+    def td(self) -> float:
+        return self.coarse_ns * 1e-9 + float(self.alignment.c[0])
+
+    @property
+    def sigma(self) -> float:
+        return float(np.sqrt(self.covariance.corrected[0, 0]))
+
+    @property
+    def depth(self) -> float:
+        """How far the V's bottom lies below the lower of its two sides, as chi-squared with correlated residuals paid for."""
+        k = int(np.argmin(self.cost))
+        sides = (self.cost[: k + 1].max(), self.cost[k:].max())
+        return float(min(sides) - self.cost[k]) / _inflation(self.covariance)
+
+
+def _inflation(covariance: Covariance) -> float:
+    """Return what chi-squared is too large by, for residuals that are larger or more correlated than their model."""
+    return covariance.variance_factor * max(1.0, float(covariance.factors[0])) ** 2
+
+
+def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings) -> TimeOffsetFit:
+    """Return the offset that lays the turns best against the reference.
+
+    BadInputError where the two share too little time. What the fit is worth is for `time_offset_verdict` to say.
+    """
+    track = track_of_gyro(reference) if isinstance(reference, ImuSamples) else track_of_poses(reference)
+    starts = find_starts(turns, track, settings.rotation)
+    if not starts:
+        raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
+    start, reach = starts[0], settings.reach_s
+    a = settle(_begin(turns, track, start, settings, reach), settings.levels)
+    bias = _bias(a)
+    if isinstance(reference, ImuSamples) and np.linalg.norm(bias) > _BIAS:
+        a = newton(replace(a, track=track_of_gyro(reference, bias)))
+    a, windows = _with_clock(a, settings, reach)
+    while True:
+        tau: Array = settings.step_s * np.arange(-round(reach / settings.step_s), round(reach / settings.step_s) + 1, dtype=float)
+        cost = sweep(a, tau)
+        k = int(np.argmin(cost))
+        inside = 2 <= k < len(tau) - 2
+        if inside and abs(tau[k] - a.c[0]) <= 2 * settings.step_s:
+            break
+        if reach >= _MAX_REACH_S:
+            break
+        reach = min(2 * reach, _MAX_REACH_S)
+        a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, c=np.array([tau[k]]))
+        a, windows = _with_clock(settle(a, settings.levels), settings, reach)
+    covariance, interval = _trust(a)
+    fit = TimeOffsetFit(
+        alignment=a,
+        start=start,
+        coarse_ns=start.coarse_ns,
+        covariance=covariance,
+        interval=interval,
+        tau=tau,
+        cost=cost,
+        second=None,
+        windows=windows,
+        clock=a.clock,
+        gyro_bias=_bias(a),
+        n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
+    )
+    return replace(fit, second=_second(fit, starts[1:]))
+
+
+def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settings, reach: float) -> Alignment:
+    whole = replace(turns, t_ns=turns.t_ns + start.coarse_ns)
+    keep = usable(whole, track, -reach - _MARGIN_S, reach + _MARGIN_S)
+    if keep.sum() < _FEWEST:
+        raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
+    stretches = split(whole.select(keep), track.origin_ns, settings.free_bias)
+    return Alignment(
+        track=track,
+        stretches=tuple(stretches),
+        keep=tuple(np.ones(len(stretch.turns.first), bool) for stretch in stretches),
+        parts=(),
+        levels=settings.levels or NoiseLevels(1.0, 1.0),
+        shape=np.ones(3),
+        R=start.R,
+        free_rotation=settings.rotation is None,
+        t_ref=float((stretches[0].t[0] + stretches[-1].t[-1]) / 2),
+        clock=None,
+        c=np.zeros(1),
+    )
+
+
+def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignment, Windows]:
+    """Return the alignment with the drift and the jumps that its windows show, and the windows."""
+    windows = window_offsets(a, reach)
+    for _ in range(_CLOCKS):
+        if not len(windows.tau):
+            return a, windows
+        clock = fit_clock((windows.start + windows.stop) / 2, windows.start, windows.stop, windows.tau, windows.sigma)
+        constant = clock.kind == "constant"
+        if constant and (a.clock is None or a.clock.kind == "constant"):
+            return replace(a, clock=clock), windows
+        drift = [clock.skew] * bool(clock.skew) + [jump.size_s for jump in clock.jumps]
+        a = replace(a, clock=clock, t_ref=clock.t_ref_s, c=np.array([clock.offset_s, *drift]))
+        a = settle(a, settings.levels)
+        windows = window_offsets(a, reach)
+    return a, windows
+
+
+def _bias(a: Alignment) -> Array:
+    """Return the bias of the track's gyroscope, whose turns are beta + b duration: c = -R b."""
+    found = [raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[1] for part in a.parts]
+    return np.asarray(-a.R.T @ np.mean(found, axis=0), np.float64) if found and len(a.R) == 3 else np.zeros(3)
+
+
+def _trust(a: Alignment) -> tuple[Covariance, tuple[float, float]]:
+    """Return the covariance of tau, and the 95 % interval: where the V has risen by chi-squared's 3.84, correlation paid for."""
+    parts = columns(a)
+    S, g, t = epochs(a, parts)
+    rows = sum(len(X) for X in parts)
+    unknowns = len(a.c) + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)
+    factor = sum(float(X[:, -1] @ X[:, -1]) for X in parts) / max(1, rows - unknowns)
+    covariance = covariance_in_time(S, g, t, factor, np.array([SCALES["s"]]))
+    rise, middle = _CHI2_95 * _inflation(covariance), float(a.c[0])
+    width = 4 * float(np.sqrt(covariance.plain[0, 0] * _inflation(covariance) / factor))
+    tau = middle + np.linspace(-width, width, _PROFILE)
+    above = sweep(a, tau)
+    above = above - above.min() - rise
+    centre = int(np.argmin(above))
+    return covariance, (_crossing(tau, above, centre, -1), _crossing(tau, above, centre, 1))
+
+
+def _crossing(x: Array, y: Array, start: int, step: int) -> float:
+    """Return where y rises through 0 from x[start] on, the end where it does not."""
+    k = start
+    while 0 <= k + step < len(x) and y[k + step] < 0:
+        k += step
+    if not 0 <= k + step < len(x):
+        return float(x[k])
+    return float(x[k] + (x[k + step] - x[k]) * -y[k] / (y[k + step] - y[k]))
+
+
+def _second(fit: TimeOffsetFit, others: Sequence[Start]) -> float | None:
+    """Return another offset that the turns may as well have: a bottom of the V, or another peak of the correlation."""
+    allowed = _RIVAL * _inflation(fit.covariance)
+    k = int(np.argmin(fit.cost))
+    lows = 1 + np.flatnonzero((fit.cost[1:-1] < fit.cost[:-2]) & (fit.cost[1:-1] <= fit.cost[2:]))
+    for low in lows[np.argsort(fit.cost[lows])]:
+        wall = fit.cost[min(low, k) : max(low, k) + 1].max() - fit.cost[low]
+        if low != k and wall > allowed and fit.cost[low] - fit.cost[k] < allowed:
+            return fit.coarse_ns * 1e-9 + float(fit.tau[low])
+    for other in others if fit.clock is None or fit.clock.kind == "constant" else ():
+        rival = _rival(fit.alignment, other, other.coarse_ns - fit.coarse_ns)
+        if rival is not None and rival[0] < allowed:
+            found = other.coarse_ns * 1e-9 + rival[1]
+            if abs(found - fit.td) > _APART_S:
+                return found
+    return None
+
+
+def _rival(a: Alignment, other: Start, further_ns: int) -> tuple[float, float] | None:
+    """Return by how much chi-squared is higher at another start's bottom, and its tau; None where too little is known at both."""
+    known = [usable(replace(part.stretch.turns, t_ns=part.stretch.turns.t_ns + further_ns), a.track, -0.1, 0.1).all() for part in a.parts]
+    if sum(known) < max(2, _RIVAL_SHARE * len(known)):
+        return None
+    parts = tuple(part for part, there in zip(a.parts, known, strict=True) if there)
+    moved_by = further_ns * 1e-9
+    shifted = tuple(replace(part, stretch=replace(part.stretch, origin_ns=a.track.origin_ns - further_ns)) for part in parts)
+    there = newton(replace(a, parts=shifted, R=other.R, t_ref=a.t_ref + moved_by, c=np.array([0.0, *a.c[1:]])))
+    costs = [sum(float(np.sum(X[:, -1] ** 2)) for X in columns(each)) for each in (replace(a, parts=parts), there)]
+    return costs[1] - costs[0], float(there.c[0])

@@ -1,0 +1,180 @@
+"""Turns of one sensor laid against the orientation of another: alpha = R beta(t + shift) + c duration + noise, R and c eliminated.
+
+Each stretch of some seconds has a bias c of its own: it takes up what drifts slowly (a gyroscope's bias, an odometry's heading, a
+lens that is slightly wrong), which tells nothing of the clocks. Whitened and with the bias projected out, stretches simply add up.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.observations import Times
+from calibkit.estimation.orientation_track import OrientationTrack
+from calibkit.estimation.turn_noise import NoiseLevels, TurnNoise, Whitener, turn_noise
+from calibkit.estimation.turns import Turns
+from calibkit.geometry import so3
+from calibkit.geometry.so3 import Array
+
+STRETCH_S = 5.0
+LEAST_TURNS = 8  # in a stretch
+TILT = 0.5  # rad; what a rotation that nothing tells may be off by: keeps its elimination finite
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Some seconds of turns."""
+
+    turns: Turns
+    origin_ns: int  # of the track
+    free_bias: bool = True
+
+    @cached_property
+    def t(self) -> Array:
+        """Return its stamps (m,) in s of the track's time, before any shift."""
+        return _seconds(self.turns.t_ns, self.origin_ns)
+
+    @property
+    def middle(self) -> Array:
+        """Return the middle of each turn (n,) s."""
+        return (self.t[self.turns.first] + self.t[self.turns.last]) / 2
+
+    @property
+    def axes(self) -> NDArray[np.intp]:
+        return np.flatnonzero(self.turns.axes)
+
+    def beta(self, track: OrientationTrack, shift: Array) -> tuple[Array, Array, Array]:
+        """Return the track's turns (n, k, 3) at stamps shifted by `shift` (m, k) s, and its rates at their starts and ends."""
+        q, rate, _ = track.at(self.t[:, None] + shift)
+        first, last = self.turns.first, self.turns.last
+        turned = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[first]), q[last]))
+        return turned, rate[first], rate[last]
+
+    def noise(self, track: OrientationTrack, R: Array, shift: Array, shape: Array) -> TurnNoise:
+        """Return the noise of its turns, its sensor turning at R omega."""
+        _, rate, _ = track.at(self.t + shift)
+        omega = np.zeros((len(self.t), 3))
+        omega[:, self.axes] = rate @ R.T
+        return turn_noise(self.turns, omega, shape)
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A stretch with its noise whitened: columns come out with unit variance and without the bias."""
+
+    stretch: Stretch
+    whiten: Whitener
+    bias: Array  # (rows, d) orthonormal: what the whitened bias spans
+    root: Array  # (d, d): bias @ root is the whitened bias
+
+    def clean(self, x: Array) -> Array:
+        """Return whitened columns for x (n, d, ...), as (rows, ...), with the bias taken out."""
+        rows = self.whiten(x.reshape(x.shape[0] * x.shape[1], -1))
+        rows -= self.bias @ (self.bias.T @ rows)
+        return rows.reshape(rows.shape[0], *x.shape[2:])
+
+
+def split(turns: Turns, origin_ns: int, free_bias: bool = True) -> list[Stretch]:
+    """Return the turns in stretches of about 5 s, at times from `origin_ns`; those with few turns are joined to the one before."""
+    start = _seconds(turns.t_ns[turns.first], origin_ns)
+    number = ((start - start[0]) / STRETCH_S).astype(np.int64)
+    ends = [0]
+    for edge in (*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(number)):
+        if edge - ends[-1] >= LEAST_TURNS:
+            ends.append(edge)
+    ends = [*(ends[:-1] if len(ends) > 1 else ends), len(number)]
+    parts = [turns.select(slice(a, b)) for a, b in pairwise(ends)]
+    return [Stretch(part, origin_ns, free_bias) for part in parts]
+
+
+def _seconds(t_ns: Times, origin_ns: int) -> Array:
+    return np.asarray((t_ns - origin_ns) * 1e-9, np.float64)
+
+
+def weigh(stretch: Stretch, noise: TurnNoise, levels: NoiseLevels) -> Weighed:
+    """Return the stretch with its noise whitened."""
+    whiten, d = noise.whitener(levels), len(stretch.axes)
+    if not stretch.free_bias:
+        return Weighed(stretch, whiten, np.zeros((d * len(stretch.turns.first), 0)), np.zeros((0, 0)))
+    columns = whiten((stretch.turns.duration[:, None, None] * np.eye(d)).reshape(-1, d))
+    return Weighed(stretch, whiten, *np.linalg.qr(columns))
+
+
+def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> tuple[Array, Array]:
+    """Return alpha - R beta - c duration (n, d) rad at one shift (m,), and the bias c (d,) rad/s."""
+    turned, _, _ = part.stretch.beta(track, shift[:, None])
+    left = _left(part.stretch, turned, R)[:, 0]
+    if not len(part.root):
+        return left, np.zeros(left.shape[1])
+    c = np.linalg.solve(part.root, part.bias.T @ part.whiten(left.reshape(-1, 1)))[:, 0]
+    return left - part.stretch.turns.duration[:, None] * c, c
+
+
+def residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
+    """Return whitened residuals (rows, k) for shifts (m, k)."""
+    turned, _, _ = part.stretch.beta(track, shift)
+    return part.clean(_left(part.stretch, turned, R).swapaxes(1, 2))
+
+
+def residual_columns(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
+    """Return whitened columns (rows, k, 4) for shifts (m, k): what the rotation moves predictions by (3), and the residuals.
+
+    R -> exp(hat(d)) R moves R beta by -hat(R beta) d; of a sensor with one axis R is that axis (1, 3), free in length, and moves by d.
+    """
+    turned, _, _ = part.stretch.beta(track, shift)
+    return part.clean(_columns(part.stretch, turned, R))
+
+
+def _left(stretch: Stretch, turned: Array, R: Array) -> Array:
+    """Return alpha - R beta (n, k, d)."""
+    return np.asarray(stretch.turns.angle[:, None, stretch.axes] - turned @ R.T, np.float64)
+
+
+def _columns(stretch: Stretch, turned: Array, R: Array) -> Array:
+    """Return (n, d, k, 4)."""
+    predicted = turned @ R.T
+    slope = -so3.hat(predicted) if len(R) == 3 else turned[:, :, None]
+    left = stretch.turns.angle[:, None, stretch.axes] - predicted
+    return np.concatenate([slope, left[..., None]], axis=3).swapaxes(1, 2)
+
+
+def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array, basis: Array) -> Array:
+    """Return whitened columns (rows, 3 + p + 1) at one shift (m,): what rotation and the clock's p numbers move, and the residuals.
+
+    d beta = J_r(beta)^-1 omega_last dt_last - J_l(beta)^-1 omega_first dt_first, with dt = basis dc.
+    """
+    stretch = part.stretch
+    turned, before, after = (x[:, 0] for x in stretch.beta(track, shift[:, None]))
+    inverse = np.linalg.inv(so3.right_jacobian(turned))
+    start, end = (np.swapaxes(inverse, 1, 2) @ before[..., None]), (inverse @ after[..., None])
+    slope = end * basis[stretch.turns.last][:, None, :] - start * basis[stretch.turns.first][:, None, :]
+    columns = _columns(stretch, turned[:, None], R)[:, :, 0]
+    return part.clean(np.concatenate([columns[..., :3], R @ slope, columns[..., 3:]], axis=2))
+
+
+def moved(R: Array, d: Array) -> Array:
+    """Return the rotation, or the one axis, moved by d (3,)."""
+    return so3.exp(d) @ R if len(R) == 3 else R + d
+
+
+def without_rotation(grams: Array) -> tuple[Array, Array]:
+    """Return the cost (k,) left of Gram matrices (k, 4, 4) of `residual_columns` once the rotation is eliminated, and its step (k, 3)."""
+    step = np.asarray(np.linalg.solve(grams[:, :3, :3] + np.eye(3) / TILT**2, grams[:, :3, 3:])[:, :, 0], np.float64)
+    cost: Array = grams[:, 3, 3] - np.sum(step * grams[:, :3, 3], axis=1)
+    return cost, step
+
+
+def usable(turns: Turns, track: OrientationTrack, low: float, high: float) -> Mask:
+    """Return the turns (n,) over which the track is known throughout, for every shift of low to high s of their stamps."""
+    bad = (track.chain[:-1] < 0) | (track.chain[:-1] != track.chain[1:])
+    before = np.concatenate([[0], np.cumsum(bad)])
+    t = _seconds(turns.t_ns, track.origin_ns)
+    start = np.floor((t[turns.first] + low) / track.step).astype(np.int64)
+    stop = np.ceil((t[turns.last] + high) / track.step).astype(np.int64)
+    inside = (start >= 0) & (stop <= len(bad))
+    start, stop = np.clip(start, 0, len(bad)), np.clip(stop, 0, len(bad))
+    return np.asarray(inside & (before[stop] == before[start]), np.bool_)

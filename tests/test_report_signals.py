@@ -24,7 +24,8 @@ def signals_of(view):
 
 
 def test_every_signal_of_the_table_is_measured_on_a_camera():
-    assert [signal.probe.key for signal in measure(view_of())] == [probe.key for probe in PROBES]
+    of_time_offsets = {"rate_growth", "over_before", "window_scatter"}
+    assert [signal.probe.key for signal in measure(view_of())] == [probe.key for probe in PROBES if probe.key not in of_time_offsets]
 
 
 def test_noise_alone_is_good():

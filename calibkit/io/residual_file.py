@@ -43,6 +43,8 @@ COLUMNS: dict[str, tuple[Dtype, tuple[int, ...]]] = {
     "axis": ("int32", ()),
     **dict.fromkeys(("tau", "deviation", "fitted", "low", "high"), ("float64", ())),
     "attitude": ("float64", (3,)),
+    **dict.fromkeys(("rate", "rate_before", "of_rate", "delay", "window_offset", "window_sigma", "clock"), ("float64", ())),
+    "before": ("float64", (3,)),
 }
 
 ArrayName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
@@ -51,7 +53,7 @@ ArrayName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 class _Entry(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    sensor: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9]*$", max_length=40)]
+    sensor: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]  # cam0, dt_imu0_cam0
     unit: Annotated[str, Field(max_length=40)]
     context: Annotated[list[ArrayName], Field(max_length=40)]
 

@@ -19,10 +19,12 @@ from matplotlib.ticker import MaxNLocator
 
 from calibkit.report.field import cells, grid, over_image, over_radius
 from calibkit.report.imu_figures import allan, stands
+from calibkit.report.look import ACCENT, INK, PALE
+from calibkit.report.rotation_figures import rates, residual_rate
 from calibkit.report.signals import frame_tilts
+from calibkit.report.time_offset_figures import offset_over_time, v_curve
 from calibkit.report.view import View, given
 
-INK, ACCENT, PALE = "#1f3b57", "#c1440e", "#9fb3c8"
 MAX_BARS = 120
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "calibkit",  # ids that do not change from run to run
@@ -211,4 +213,20 @@ PICTURES = (
             "Residuals of one size without a trend are good, and attitudes all over both discs: where none is, scale and misalignment "
             "hang on the others.",
             frozenset({"attitude"}), 3.2, stands),
+    Picture("v_curve", "The V: cost over the time offset",
+            "One narrow bottom between steep sides is good (the numbers are what an offset there costs); a flat bowl cannot tell the "
+            "offset, and a second bottom may be the true one.",
+            frozenset({"delay"}), 3.4, v_curve),
+    Picture("rates", "Rotation rates before and after",
+            "After alignment the two lie on each other and their difference is noise around zero; a difference that swings with every "
+            "rise and fall of the rates is time offset.",
+            frozenset({"rate", "of_rate", "t"}), 4.4, rates),
+    Picture("residual_rate", "Residual against rotation",
+            "After alignment both are flat, at the height of the noise; what rises with the change of rate is time offset, with the rate "
+            "itself a wrong scale of a gyroscope or stamps that jitter.",
+            frozenset({"rate", "t"}), 3.4, residual_rate),
+    Picture("offset_over_time", "Time offset over time",
+            "Windows on the line, within their bars, are good; a slope is a clock that runs fast or slow, a step is frames or stamps that "
+            "were lost, and scatter beyond the bars is more than their sigma says.",
+            frozenset({"window_offset", "window_sigma", "t"}), 3.6, offset_over_time),
 )  # fmt: skip

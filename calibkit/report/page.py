@@ -10,9 +10,10 @@ from markupsafe import Markup
 from calibkit.data.rig import CONVENTIONS
 from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
-from calibkit.report.figures import draw
+from calibkit.report.figures import PICTURES, Picture, draw
 from calibkit.report.parameters import sigma_note
 from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines
+from calibkit.report.view import View
 from calibkit.version import __version__
 
 MEANING = {
@@ -24,7 +25,8 @@ MEANING = {
 
 def build(summary: Summary) -> dict[str, bytes]:
     """Return the report's files by name: report.html, report.json and the pictures."""
-    sections, images, pictures = [], {}, []
+    sections: dict[str, tuple[View, list[tuple[Picture, Markup]]]] = {}  # a sensor's sets under one heading
+    images, pictures = {}, []
     for view in summary.views:
         drawn = draw(view)
         for one in drawn:
@@ -32,13 +34,13 @@ def build(summary: Summary) -> dict[str, bytes]:
             images[name] = one.png
             what = {"sensor": view.sensor, "stage": view.stage, "key": one.picture.key, "caption": one.picture.caption}
             pictures.append({"file": name, **what})
-        sections.append((view, [(one.picture, _data_uri("image/svg+xml", one.svg)) for one in drawn]))
+        sections.setdefault(view.name, (view, []))[1].extend((one.picture, _data_uri("image/svg+xml", one.svg)) for one in drawn)
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
         told=[*camera_lines(summary), *stage_lines(summary)],
         meaning=MEANING[summary.verdict],
-        sections=sections,
+        sections=[(view, sorted(drawn, key=lambda pair: PICTURES.index(pair[0]))) for view, drawn in sections.values()],
         thumbnails=thumbnails,
         conventions=CONVENTIONS,
         about=_about(summary),

@@ -3,8 +3,7 @@
 A new signal is one function View -> Measured and one line in PROBES.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from math import inf, isfinite
 
 import numpy as np
@@ -12,74 +11,13 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
+from calibkit.report.probe import SIGNIFICANT, Measured, Probe, Signal
+from calibkit.report.time_offset_signals import over_before, rate_growth, window_scatter
 from calibkit.report.view import Array, View, given, rms
 
 GOOD_RMS_PX = 0.3
-SIGNIFICANT = 4.0  # sigma below which structure is taken for chance
 COVERAGE_GRID = (8, 6)
 MIN_CORNERS = 3  # in a cell that counts as covered
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A value in its probe's unit and what there is to say about it; `exempt` when the value tells nothing (too few data, chance)."""
-
-    value: float
-    note: str = ""
-    exempt: bool = False
-
-
-@dataclass(frozen=True)
-class Probe:
-    """One signal: PASS up to `good`, CHECK up to `bad`, FAIL beyond (the other way round where bad < good)."""
-
-    key: str
-    title: str
-    unit: str
-    good: float
-    bad: float
-    needs: frozenset[str]
-    measure: Callable[[View], Measured]
-    means: str  # what it says when it is not good, and the remedy
-
-    def judge(self, value: float) -> Verdict:
-        sign = 1 if self.bad >= self.good else -1
-        if sign * value <= sign * self.good:
-            return Verdict.PASS
-        return Verdict.CHECK if sign * value <= sign * self.bad else Verdict.FAIL
-
-    @property
-    def limit(self) -> str:
-        """What is good, and beyond which it fails, as people read it."""
-        below, above = ("≤", ">") if self.bad >= self.good else ("≥", "<")
-        unit = f" {self.unit}" if self.unit else ""
-        good = f"{below} {self.good:g}{unit}"
-        return f"{good} (FAIL {above} {self.bad:g}{unit})" if isfinite(self.bad) else good
-
-
-@dataclass(frozen=True)
-class Signal:
-    """What a probe found in one sensor's residuals."""
-
-    probe: Probe
-    stage: str
-    sensor: str
-    value: float
-    note: str
-    verdict: Verdict
-
-    @property
-    def mark(self) -> str:
-        """The verdict in one word; "-" where the value is beyond its limit but tells nothing, as the note says."""
-        return self.verdict.value if self.probe.judge(self.value) is self.verdict else "-"
-
-    @property
-    def reason(self) -> Reason:
-        """The signal as a sentence of a verdict."""
-        unit = f" {self.probe.unit}" if self.probe.unit else ""
-        note = f" ({self.note})" if self.note else ""
-        means = "" if self.verdict is Verdict.PASS else f": {self.probe.means}"
-        return Reason(self.verdict, f"{self.sensor}: {self.probe.title} {self.value:.3g}{unit}{note}, good is {self.probe.limit}{means}")
 
 
 def measure(view: View) -> list[Signal]:
@@ -212,4 +150,12 @@ PROBES = (
           "the lens is extrapolated where no corner was: bring the board there"),
     Probe("tilt_range", "tilt of the boards (90th percentile)", "deg", 20, -inf, frozenset({"tilt", "frame"}), _tilt,
           "boards facing the camera leave focal length and distance coupled: tilt the board by 30 to 45 deg"),
+    Probe("rate_growth", "residual's growth with the rotation rate", "%", 3, inf, frozenset({"rate", "t"}), rate_growth,
+          "stamps that jitter or clocks that drift (stamp in hardware), a wrong scale of a gyroscope (calibkit imu) or images that blur "
+          "(shorten the exposure)"),
+    Probe("over_before", "residual over that of the stamps as they are", "", 1.1, inf, frozenset({"before"}), over_before,
+          "the time offset makes it worse: a wrong bottom, or a clock that jumps; look at the V and at the offset over time"),
+    Probe("window_scatter", "scatter of the time offset between windows, over sigma", "", 2.5, inf,
+          frozenset({"window_offset", "window_sigma"}), window_scatter,
+          "stamps wander by more than the clock's line says: believe the time offset to that scatter, and stamp in hardware"),
 )  # fmt: skip

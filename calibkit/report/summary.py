@@ -11,7 +11,8 @@ from calibkit.data.rig import Rig
 from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import one_line
 from calibkit.report.parameters import Row, parts, rig_reasons, rows, sigma_note
-from calibkit.report.signals import Signal, measure, not_good
+from calibkit.report.probe import Signal
+from calibkit.report.signals import measure, not_good
 from calibkit.report.view import View, views
 
 SCHEMA = "calibkit-report/1"

@@ -17,6 +17,17 @@ Index = NDArray[np.intp]
 T = TypeVar("T")
 
 _ABSURD = 1e9  # in any unit: larger residuals mean nothing, and their squares would overflow
+_COSTLY = 1e18  # of a chi-squared, which is a square already
+
+
+@dataclass(frozen=True)
+class Bottom:
+    """The bottom of a V: t_a = t_b + offset, with its 95 % interval; a second one that the cost cannot tell from it."""
+
+    offset: float  # s
+    low: float
+    high: float
+    second: float | None = None
 
 
 @dataclass(frozen=True)
@@ -44,6 +55,16 @@ class View:
     high: Array | None = None
     attitude: Array | None = None  # (n, 3) unit vector of gravity's reaction in the IMU's frame
     noise: Mapping[ImuAxis, Noise] = field(default_factory=dict)  # of an IMU, by axis
+    t: Array | None = None  # (n,) s since the first residual of this sensor
+    rate: Array | None = None  # (n,) rad/s |omega| of `a` of dt_a_b, at b's stamps plus the offset; here and below NaN where unknown
+    rate_before: Array | None = None  # (n,) rad/s the same at b's stamps as they are
+    of_rate: Array | None = None  # (n,) rad/s |omega| of `b`
+    before: Array | None = None  # (n, 3) the residual with b's stamps as they are
+    delay: Array | None = None  # (n,) s the offset that was tried: raw is its chi-squared above the bottom's
+    window_offset: Array | None = None  # (n,) s of one window alone: raw is that less the clock's
+    window_sigma: Array | None = None  # (n,) s
+    clock: Array | None = None  # (n,) s the offset that the model of the clock has there
+    bottom: Bottom | None = None  # None: there is none, or the rig says that the offset is not observable
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
     @property
@@ -84,13 +105,16 @@ def views(result: Result) -> list[View]:
 def _view(result: Result, residuals: ResidualSet) -> View:
     camera = result.rig.cameras.get(residuals.sensor)
     context = residuals.context
-    good = np.all(np.abs(residuals.raw) < _ABSURD, axis=1)  # NaN is not
+    good = np.all(np.abs(residuals.raw) < (_COSTLY if "delay" in context else _ABSURD), axis=1)  # NaN is not
     if "axis" in context:
         good &= np.isin(context["axis"], np.arange(len(get_args(ImuAxis))))
     for key in ("tau", "deviation", "fitted", "low", "high"):  # drawn in logarithms
         if key in context:
             value = context[key].astype(float)
             good &= np.isfinite(value) & (value > 0)
+    for key in ("delay", "window_offset"):  # where to draw the row
+        if key in context:
+            good &= np.abs(context[key].astype(float)) < _ABSURD
     if "uv" in context:
         good &= np.all(np.isfinite(context["uv"].astype(float)), axis=1)
 
@@ -100,6 +124,14 @@ def _view(result: Result, residuals: ResidualSet) -> View:
     def floats(key: str, width: int | None = None) -> Array | None:
         found = column(key)
         return None if found is None or (width and found.shape[1:] != (width,)) else found.astype(float)
+
+    def partly(key: str, width: int | None = None) -> Array | None:
+        """Return a column that may be unknown in some rows, NaN there; None where it is unknown in all."""
+        found = floats(key, width)
+        if found is None:
+            return None
+        found = np.where(np.abs(found) < _ABSURD, found, np.nan)
+        return found if np.isfinite(found).any() else None
 
     kept, corner, tilt, axis = column("kept"), column("corner"), column("tilt"), column("axis")
     uv = column("uv") if residuals.raw.shape[1] == 2 else None
@@ -133,7 +165,41 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         low=floats("low"),
         high=floats("high"),
         attitude=floats("attitude", 3),
+        t=_seconds(result, residuals)[good],
+        rate=partly("rate"),
+        rate_before=partly("rate_before"),
+        of_rate=partly("of_rate"),
+        before=partly("before", 3),
+        delay=floats("delay"),
+        window_offset=floats("window_offset"),
+        window_sigma=partly("window_sigma"),
+        clock=partly("clock"),
+        bottom=_bottom(result, residuals.sensor),
     )
+
+
+def _seconds(result: Result, residuals: ResidualSet) -> Array:
+    """Return the rows' times since the first residual of the sensor; as floats (to 256 ns), because a stranger's stamps may overflow."""
+    firsts = [float(r.t_ns.min()) for r in result.residuals if r.sensor == residuals.sensor and len(r.t_ns) and "delay" not in r.context]
+    return (residuals.t_ns.astype(float) - min(firsts, default=0.0)) * 1e-9
+
+
+def _bottom(result: Result, sensor: str) -> Bottom | None:
+    """Return facts["v"][sensor] where it holds an offset and its interval, in order, and the rig does not mark it as not observable."""
+    entry = result.rig.time_offsets.get(sensor)
+    by_sensor = result.facts.get("v")
+    found = by_sensor.get(sensor) if isinstance(by_sensor, Mapping) else None
+    if not isinstance(found, Mapping) or (entry is not None and entry.offset.value is None):
+        return None
+
+    def seconds(key: str) -> float | None:
+        value = found.get(key)
+        return float(value) if isinstance(value, int | float) and abs(value) < _ABSURD else None
+
+    offset, low, high = seconds("offset"), seconds("low"), seconds("high")
+    if offset is None or low is None or high is None or not low <= offset <= high or low == high:
+        return None
+    return Bottom(offset, low, high, seconds("second"))
 
 
 def _frames(facts: Mapping[str, object], sensor: str, frame: NDArray[np.generic] | None) -> tuple[Index | None, tuple[str, ...]]:

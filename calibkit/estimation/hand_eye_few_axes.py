@@ -47,11 +47,19 @@ SEEDS: dict[int, Solver] = {0: no_axis, 1: one_axis, 2: park, 3: park}
 
 
 def _turn(b: Array, a: Array) -> Array:
-    """Return the half turn about the middle of a and b, which carries b's direction to a, b of any length and a of length 1."""
+    """Return a rotation that carries b's direction to a, for b of any length and a of length 1: a half turn about the middle of the two.
+
+    Where they point apart, b is first turned by 180 deg about an axis across a.
+    """
     length = np.linalg.norm(b, axis=-1, keepdims=True)
-    half = a + np.where(length > 0, b / np.maximum(length, 1e-300), a)
-    size = np.linalg.norm(half, axis=-1, keepdims=True)
-    across = np.cross(a, np.eye(3)[np.argmin(np.abs(a), axis=-1)])  # any such axis where a and b oppose
-    middle = np.where(size > 1e-6, half / np.maximum(size, 1e-6), across / np.linalg.norm(across, axis=-1, keepdims=True))
-    out: Array = 2 * middle[..., :, None] * middle[..., None, :] - np.eye(3)
+    b = np.where(length > 0, b / np.maximum(length, 1e-300), a)
+    first = np.where(
+        np.sum(a * b, axis=-1)[..., None, None] < 0, _half_turn(np.cross(a, np.eye(3)[np.argmin(np.abs(a), axis=-1)])), np.eye(3)
+    )
+    return _half_turn(a + (first @ b[..., None])[..., 0]) @ first
+
+
+def _half_turn(v: Array) -> Array:
+    """Return the rotation by 180 deg about v: 2 v v^T / |v|^2 - I."""
+    out: Array = 2 * v[..., :, None] * v[..., None, :] / np.sum(v * v, axis=-1)[..., None, None] - np.eye(3)
     return out

@@ -79,17 +79,17 @@ def quaternions(A: Array, B: Array, root: Array) -> tuple[Array, Array]:
     free = np.take_along_axis(unsure, pair[..., 0], axis=-1)
     s = np.where(free[..., None, :], _SIGNS, 1.0)
     R = so3.project(np.swapaxes(pa, -1, -2)[..., None, :, :] @ (s[..., None] * pb[..., None, :, :]))
-    for _ in range(2):  # the second time with the rotation of all motions, not of two
-        along = np.einsum("...na,...hab,...nb->...hn", va, R, vb) + (root**2 * qa[..., 3] * qb[..., 3])[..., None, :]
-        signs = np.where(unsure[..., None, :] & (along < 0), -1.0, 1.0)
-        R = so3.project(np.einsum("...na,...hn,...nb->...hab", va, signs, vb))
+    along = np.einsum("...na,...hab,...nb->...hn", va, R, vb)
+    signs = np.where(unsure[..., None, :] & (along < 0), -1.0, 1.0)
+    R = so3.project(np.einsum("...na,...hn,...nb->...hab", va, signs, vb))  # of all motions, no more of two
     turned = signs[..., None] * np.einsum("...hab,...nb->...hna", R, vb)
     turn = np.sum((va[..., None, :, :] - turned) ** 2, axis=(-1, -2))
     turn += np.sum((root[..., None, :] * (qa[..., None, :, 3] - signs * qb[..., None, :, 3])) ** 2, axis=-1)
     da, db = np.sum(va * A[..., :3, 3], axis=-1), np.sum(vb * B[..., :3, 3], axis=-1)
     slide = np.sum((da[..., None, :] - signs * db[..., None, :]) ** 2, axis=-1)
     size = np.sum(A[..., :3, 3] ** 2 + B[..., :3, 3] ** 2, axis=(-1, -2))[..., None]
-    score = 3 * np.log(turn + 1e-26) + np.log(slide + 1e-26 * size + 1e-300)
+    # Nothing is known to better than 10 urad and a millionth of the way: below, agreement is no evidence.
+    score = 3 * np.log(turn + 1e-10) + np.log(slide + 1e-12 * size + 1e-300)
     best = np.argmin(score, axis=-1)[..., None, None]
     return qa, qb * np.take_along_axis(signs, best, axis=-2)[..., 0, :, None]
 

@@ -54,7 +54,7 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
     """Return X by Andreff, Horaud and Espiau 1999, eq. 10, R_X and t at once and R_X made a rotation afterwards.
 
     (I - R_A (x) R_B) vec R_X = 0 and (I (x) t_B^T) vec R_X + (I - R_A) t = t_A, vec by rows; rows of rad and of m count alike.
-    It needs large rotations: noise shrinks vec R_X, and t makes up for the part of t_B that goes missing.
+    It needs large rotations: noise shrinks vec R_X, and t makes up for the part of t_B that goes missing. Without any t_B, R_X is I.
     """
     A, B, root = check(A, B, weights)
     RA, RB, tA, tB = A[..., :3, :3], B[..., :3, :3], A[..., :3, 3], B[..., :3, 3]

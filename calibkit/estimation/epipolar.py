@@ -25,10 +25,11 @@ _MEDIAN_OF_NORMAL = 0.6745  # of |x| for sigma 1
 CUT = 3.0  # sigmas: what lies beyond is a wrong track
 TRUNCATED = 0.9733  # variance of a normal variable cut there
 _CAUCHY = 2.4  # sigmas
+_FAITHFUL = 0.75  # of a track's pairs
 _LONGEST = 0.3  # rad, of one step
-_ALIKE = 25.0  # chi-squared between solutions that fit alike
-_SAME = 1e-3  # rad between rotations that are one solution
-_CLEARLY = 1.5  # times the spread in depth
+_FLAT = 2.5  # times the noise's variance about a plane: not told from one
+_LEVEL = 0.05  # of the parallax, or so near to a plane that a calibration's or a tracker's errors hide it
+_EXCLUDED = 10.0  # sqrt(points) in chi-squared of points behind the cameras
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,7 @@ class Matches:
     last: Array  # (p, 3, n) unit rays in view 2
     J: Array  # (p, 2, 3, n) px of view 1 per unit of its ray, J first = 0
     given: Array  # (p, n) 1 where there is a point, 0 where padded
-
-    def select(self, keep: NDArray[np.generic]) -> "Matches":
-        """Return some of the pairs."""
-        return Matches(self.first[keep], self.last[keep], self.J[keep], self.given[keep])
+    track: NDArray[np.intp]  # (p, n) which track it is of, numbered from 0
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,8 @@ class Residuals:
     along: Array  # (p, n) px, likewise along the line; positive where the point is before the cameras
     g: Array  # (p, 3, n)
     q: Array  # (p, 3, n), s = q . g, ds/dR = g x q for R <- exp(hat(w)) R
-    depth: Array  # (p, n), ds/dt = depth q; the point's inverse depth in units of the baseline
+    depth: Array  # (p, n), ds/dt = depth q; the point's inverse distance from view 2 in units of the baseline
+    length: Array  # (p, n) |d| px, along = depth |d| / sqrt(2)
     normal: Array  # (p, 2, n) unit vector across the line
 
 
@@ -67,7 +66,7 @@ def residuals(m: Matches, R: Array, t: Array) -> Residuals:
     across = (e[0] * d[1] - e[1] * d[0]) / _SQRT2
     along = -(e[0] * d[0] + e[1] * d[1]) / _SQRT2
     q = (m.J[:, 0] * d[1][:, None] - m.J[:, 1] * d[0][:, None]) / _SQRT2
-    return Residuals(across, along, g, q, along * (_SQRT2 / length), np.stack([d[1], -d[0]], axis=1))
+    return Residuals(across, along, g, q, along * (_SQRT2 / length), length, np.stack([d[1], -d[0]], axis=1))
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -133,7 +132,9 @@ def rotation_only(m: Matches, steps: int = 6) -> tuple[Array, Array, Array]:
         if step < steps:
             R = so3.exp(-_solve(H, sum(score.sum(axis=-1) for score in scores))) @ R
     score = scores[0] + scores[1]
-    inverse = np.linalg.inv(H + _TINY * np.eye(3))
+    # The mean derivative of a score w(|e|) e in two dimensions is w^2 for Cauchy's w.
+    slope = sum((row * (w * w)[:, None]) @ np.swapaxes(row, -1, -2) for row in rows)
+    inverse = np.linalg.inv(slope + _TINY * np.eye(3))
     return R, inverse @ (score @ np.swapaxes(score, -1, -2)) @ inverse, w
 
 
@@ -189,29 +190,38 @@ def refine(m: Matches, R: Array, t: Array, steps: int, keep: Array | None = None
     return R, t
 
 
-def choose(m: Matches, candidates: list[tuple[Array, Array]]) -> tuple[Array, Array, Mask]:
-    """Return each pair's R, t (of the sign that puts the points before the cameras), and whether no other candidate is as good.
+def choose(m: Matches, candidates: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return each pair's best R and t, the sign of t such that the points lie before the cameras.
 
-    chi-squared is across the lines, and along them for points behind the cameras. A plane has two solutions that fit alike, the false one with
-    the plane's normal for t (Longuet-Higgins 1984): there inverse depths range from next to nothing, so the least spread in depth is taken.
+    The fit is chi-squared across the lines, and along them for points behind the cameras.
     """
     R, t = (np.stack(parts) for parts in zip(*candidates, strict=True))
     found = [residuals(m, *candidate) for candidate in candidates]
     sigma = np.min([sigma_of(r.across, m.given) for r in found], axis=0)[:, None]
-    fits, spreads, signs = [], [], []
-    for r in found:
-        both = [_chi_squared(r.across, side * r.along, m.given, sigma) for side in (1.0, -1.0)]
-        sign = np.where(both[0] <= both[1], 1.0, -1.0)
-        middle = scale(r.depth * sign[:, None], m.given)
-        signs.append(sign)
-        fits.append(np.minimum(*both))
-        spreads.append(scale(np.abs(r.depth * sign[:, None] - middle[:, None]), m.given) / middle)
-    fit, spread, pairs = np.array(fits), np.array(spreads), np.arange(len(m.first))
-    best = np.argmin(np.where(fit <= fit.min(axis=0) + _ALIKE, spread, np.inf), axis=0)
-    apart = np.linalg.norm(so3.log(np.swapaxes(R[best, pairs], -1, -2) @ R), axis=-1)
-    # Two solutions with like spreads, and in one of them points behind the camera are few: nobody can tell.
-    rival = (fit <= fit.min(axis=0) + _ALIKE) & (apart > _SAME) & (spread < _CLEARLY * spread[best, pairs])
-    return R[best, pairs], t[best, pairs] * np.array(signs)[best, pairs, None], ~rival.any(axis=0)
+    fit = np.array([[_chi_squared(r.across, side * r.along, m.given, sigma) for r in found] for side in (1.0, -1.0)])
+    best, pairs = np.argmin(fit.min(axis=0), axis=0), np.arange(len(m.first))
+    side = np.where(fit[0, best, pairs] <= fit[1, best, pairs], 1.0, -1.0)
+    return R[best, pairs], t[best, pairs] * side[:, None]
+
+
+def two_fold(m: Matches, R: Array, t: Array, keep: Array) -> Mask:
+    """Return where (p,) another solution fits as well: on a plane, whose inverse distances are a . g, (a, t) and (t, a) make the same flow.
+
+    The other rotation differs (Longuet-Higgins 1984), and only points that it puts behind the cameras, t . g < 0, tell it from the true one.
+    """
+    r = residuals(m, R, t)
+    n = np.maximum(keep.sum(axis=-1), 6)
+    variance = np.sum(keep * r.across**2, axis=-1) / (n - 5)
+    columns = r.g * (r.length / _SQRT2)[:, None]
+    weighted = columns * keep[:, None]
+    a = _solve(weighted @ np.swapaxes(columns, -1, -2), (weighted @ r.along[..., None])[..., 0])
+    off = r.along - (a[:, None] @ columns)[:, 0]
+    bent = np.sum(keep * off**2, axis=-1)
+    flat = (bent < _FLAT * n * variance) | (bent < _LEVEL**2 * np.sum(keep * r.along**2, axis=-1))
+    mirrored = np.sum(r.g * t[..., None], axis=1) * np.linalg.norm(np.einsum("pkcn,pc->pkn", m.J, a), axis=1) / _SQRT2
+    behind = [np.sum(keep * np.minimum(side * mirrored, 0) ** 2, axis=-1) for side in (1.0, -1.0)]
+    out: Mask = flat & (np.minimum(*behind) < _EXCLUDED * np.sqrt(n) * variance)
+    return out
 
 
 def _chi_squared(across: Array, along: Array, given: Array, sigma: Array) -> Array:
@@ -220,10 +230,14 @@ def _chi_squared(across: Array, along: Array, given: Array, sigma: Array) -> Arr
 
 
 def agreeing(m: Matches, R: Array, t: Array) -> Array:
-    """Return 1 for the points (p, n) that are within CUT sigmas of their epipolar line, and not farther behind the cameras; else 0."""
+    """Return 1 for the points (p, n) that are within CUT sigmas of their epipolar line, not farther behind the cameras, and whose track mostly is."""
     r = residuals(m, R, t)
     sigma = sigma_of(r.across, m.given)[:, None]
-    return m.given * (np.abs(r.across) < CUT * sigma) * (r.along > -CUT * sigma)
+    alone = m.given * (np.abs(r.across) < CUT * sigma) * (r.along > -CUT * sigma)
+    # What slides along the line in one pair leaves it in another: a track is right or wrong as a whole.
+    seen, agreed = (np.bincount(m.track.ravel(), weights.ravel()) for weights in (m.given, alone))
+    out: Array = alone * (agreed > _FAITHFUL * seen)[m.track]
+    return out
 
 
 @dataclass(frozen=True)
@@ -263,10 +277,10 @@ def trust(m: Matches, R: Array, t: Array, keep: Array) -> Trust:
 
 
 def parallax_cov(m: Matches, parallax: Array) -> Array:
-    """Return the covariance (p, 3, 3) rad^2 of what a parallax (p,) px, neglected, does to a rotation: not about the mean ray."""
+    """Return the covariance (p, 3, 3) rad^2 of what a parallax (p,) px, neglected, does to a rotation: little about the mean ray."""
     n = np.maximum(m.given.sum(axis=-1), 1)
     mean = np.sum(m.first * m.given[:, None], axis=-1)
     mean /= np.linalg.norm(mean, axis=-1, keepdims=True) + _TINY
     focal2 = np.sum(m.J**2 * m.given[:, None, None], axis=(1, 2, 3)) / (2 * n) + _TINY  # px/rad, squared
-    out: Array = (parallax**2 / focal2)[:, None, None] * (np.eye(3) - mean[:, :, None] * mean[:, None, :])
+    out: Array = (parallax**2 / focal2)[:, None, None] * (np.eye(3) - 0.95 * mean[:, :, None] * mean[:, None, :])
     return out

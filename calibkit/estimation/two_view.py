@@ -21,6 +21,7 @@ Rows = NDArray[np.intp]
 
 _CHUNK = 128  # pairs at once: memory stays flat, arrays in the cache
 _STARTS = 3
+_STEPS = 4
 _FEWEST = 25  # points: five unknowns, wrong tracks and a scatter to be estimated
 _FEWEST_SHARE = 0.4  # of the points of a pair; where fewer agree, something else moves
 _LEAST_PARALLAX = 2.5  # sigmas; below, the direction of the translation is noise, and the rotation with it
@@ -129,20 +130,23 @@ def _batch(tracks: FeatureTracks, lens: _Lens, low: int, high: int) -> _Batch:
     p, n = high - low, max(int(count.max(initial=0)), 1)
     first, last, jacobian, given = np.zeros((p, 3, n)), np.zeros((p, 3, n)), np.zeros((p, 2, 3, n)), np.zeros((p, n))
     first[pair, :, place], last[pair, :, place], jacobian[pair, :, :, place], given[pair, place] = rays[row], rays[next_row], J[row], 1
-    return _Batch(Matches(first, last, jacobian, given), pair, place, row, next_row)
+    whose = np.zeros((p, n), np.intp)
+    whose[pair, place] = np.unique(track[row], return_inverse=True)[1]
+    return _Batch(Matches(first, last, jacobian, given, whose), pair, place, row, next_row)
 
 
 def _two_view(m: Matches) -> _Solved:
     """Return the turns of pairs: rotation alone for a start, the best of several translations, then least squares on what agrees."""
     R_0, cov_0, weights = epipolar.rotation_only(m)
     R_s, t_s = epipolar.starts(m, R_0, weights, _STARTS)
-    candidates = [epipolar.refine(m, R, t, 4) for R, t in zip(R_s, t_s, strict=True)]
-    R, t, certain = epipolar.choose(m, candidates)
+    candidates = [epipolar.refine(m, R, t, _STEPS) for R, t in zip(R_s, t_s, strict=True)]
+    R, t = epipolar.choose(m, candidates)
     keep = epipolar.agreeing(m, R, t)
     R, t = epipolar.refine(m, R, t, 3, keep)
     fit = epipolar.trust(m, R, t, keep)
     n = keep.sum(axis=-1)
-    good = certain & (n >= _FEWEST) & (n >= _FEWEST_SHARE * m.given.sum(axis=-1))
+    certain = ~epipolar.two_fold(m, R, t, keep)
+    good = (n >= _FEWEST) & (n >= _FEWEST_SHARE * m.given.sum(axis=-1))
     # Without parallax the translation drops out: the rotation alone, with what the rest of parallax may do to it.
     still = fit.parallax < _LEAST_PARALLAX * fit.sigma
     R[still] = R_0[still]
@@ -150,7 +154,7 @@ def _two_view(m: Matches) -> _Solved:
     cov[still] = cov_0[still] + epipolar.parallax_cov(m, fit.parallax)[still]
     influence[still] = 0
     largest = np.linalg.eigvalsh(cov)[:, -1]
-    return _Solved(R, cov, good & (largest < _LARGEST_SIGMA**2), influence, fit.across, fit.normal, fit.sigma)
+    return _Solved(R, cov, good & (certain | still) & (largest < _LARGEST_SIGMA**2), influence, fit.across, fit.normal, fit.sigma)
 
 
 def _plain(m: Matches) -> _Solved:
@@ -174,11 +178,11 @@ def _shared(batch: _Batch, solved: _Solved) -> tuple[Array, Array]:
     before = np.flatnonzero(after >= 0)
     after = after[before]
     k, i = batch.pair[before], batch.place[before]
-    l, j = batch.pair[after], batch.place[after]
-    G, G_next = solved.influence[k, :, i], solved.influence[l, :, j]
-    c = 0.5 * solved.sigma[k] * solved.sigma[l] * np.sum(solved.normal[k, :, i] * solved.normal[l, :, j], axis=-1)
-    c *= np.any(G != 0, axis=-1) & np.any(G_next != 0, axis=-1) & solved.good[k] & solved.good[l]
-    product = solved.across[k, i] * solved.across[l, j]
+    after_k, j = batch.pair[after], batch.place[after]
+    G, G_next = solved.influence[k, :, i], solved.influence[after_k, :, j]
+    c = 0.5 * solved.sigma[k] * solved.sigma[after_k] * np.sum(solved.normal[k, :, i] * solved.normal[after_k, :, j], axis=-1)
+    c *= np.any(G != 0, axis=-1) & np.any(G_next != 0, axis=-1) & solved.good[k] & solved.good[after_k]
+    product = solved.across[k, i] * solved.across[after_k, j]
     p = len(solved.R)
     ends = np.zeros((p, 3, 3))
     np.add.at(ends, k, c[:, None, None] * G[:, :, None] * G_next[:, None, :])

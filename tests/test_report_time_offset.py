@@ -126,9 +126,7 @@ def draw_keys(view):
     return [one for one in PICTURES if view.has(one.needs)]
 
 
-@pytest.mark.parametrize(
-    "case", ["good", "jump", pytest.param("far", marks=pytest.mark.slow), pytest.param("flat", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("case", ["good", *(pytest.param(case, marks=pytest.mark.slow) for case in CASES if case != "good")])
 def test_each_case_has_its_four_pictures_twice_the_same(case):
     first, again = (drawn_of(result(**CASES[case])) for _ in range(2))
     assert set(first) == PICTURES_OF

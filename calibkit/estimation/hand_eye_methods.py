@@ -38,7 +38,8 @@ def park(A: Array, B: Array, weights: Array | None = None) -> Array:
     """Return X by Park and Martin 1994: R_X = (M^T M)^(-1/2) M^T, M = sum beta alpha^T, of least sum |alpha - R_X beta|^2; then t."""
     A, B, root = check(A, B, weights)
     qa, qb = quaternions(A, B, root)
-    alpha, beta = _log(qa) * root[..., None], _log(qb) * root[..., None]
+    # so3's logarithm is that of the q with w >= 0.
+    alpha, beta = so3.quat_log(qa) * root[..., None], so3.quat_log(qb) * np.where(qb[..., 3] < 0, -root, root)[..., None]
     R = so3.project(np.swapaxes(alpha, -1, -2) @ beta)
     return se3.make(R, translation(A, B, R, root))
 
@@ -120,14 +121,6 @@ def _null_quaternion(qa: Array, qb: Array, root: Array) -> Array:
     blocks[..., :3, 3], blocks[..., 3, :3] = a - b, b - a
     blocks[..., 3, 3] = qa[..., 3] - qb[..., 3]
     return null_space(rows(blocks, root), 1)[..., 0, :]
-
-
-def _log(q: Array) -> Array:
-    """Return 2 atan2(|v|, w) v / |v|, beyond pi where w < 0: q_B must not be turned back to the sign that `quaternions` gave up."""
-    norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
-    small = norm < 1e-9
-    out: Array = np.where(small, 2.0, 2 * np.arctan2(norm, q[..., 3:]) / np.where(small, 1.0, norm)) * q[..., :3]
-    return out
 
 
 def _dual(q: Array, t: Array) -> Array:

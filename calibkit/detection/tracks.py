@@ -15,12 +15,13 @@ from calibkit.errors import BadInputError, one_line
 from calibkit.opencv import cv2
 
 Points = NDArray[np.float32]
+Gray = NDArray[np.uint8]
 
 _FEATURES = 200
 _CELLS = (6, 4)  # of the image, across and down: each gets its share of the features
 _SPACING_PX = 9  # between features
 _EDGE_PX = 6
-_WINDOW, _LEVELS = (21, 21), 3  # 40 px from frame to frame, 1.7 rad/s at 20 Hz and f = 460, with a margin of two
+_WINDOW, _LEVELS = (15, 15), 3  # 60 px beyond where they are looked for; of wider windows the middle is less exact: they turn and stretch
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 _BACK_PX = 0.5  # how far a feature tracked there and back may miss its start
 _WEAKEST = 0.01  # of the strongest corner of the image
@@ -104,6 +105,14 @@ def _decode(frame: ImageFrame) -> Decoded:
         return frame, error
 
 
+def _flow(last: Gray, image: Gray, uv: Points, shift: Points) -> tuple[Points, NDArray[np.bool_]]:
+    """Return where the features (n, 2) of the last image are in this one, looked for at uv + shift first, and which were found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        last, image, uv, uv + shift, winSize=_WINDOW, maxLevel=_LEVELS, criteria=_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    return np.asarray(there, np.float32), np.asarray(found)[:, 0] > 0
+
+
 class _Tracker:
     """The features in the last image; `follow` moves them on to the next, and finds new ones where they have become few."""
 
@@ -125,29 +134,28 @@ class _Tracker:
         self._last = gray
         return self._number, self._uv
 
-    def _eight_bit(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
-        """Return the image with 8 bits: one gain for the recording, from the first image's bright end, so that gray levels stay comparable."""
+    def _eight_bit(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Gray:
+        """Return the image with 8 bits: one gain for the recording, from the first image's bright end."""
         if image.dtype == np.uint8:
-            return np.ascontiguousarray(image, np.uint8)
+            return image.astype(np.uint8, copy=False)
         if self._gain is None:
             self._gain = 200.0 / max(float(np.percentile(image, 99.5)), 1.0)
-        return np.clip(np.rint(image * self._gain), 0, 255).astype(np.uint8)
+        out: Gray = np.clip(np.rint(image * self._gain), 0, 255).astype(np.uint8)
+        return out
 
-    def _move(self, gray: NDArray[np.uint8]) -> None:
-        options = {"winSize": _WINDOW, "maxLevel": _LEVELS, "criteria": _STOP, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._last, gray, self._uv, self._uv + self._shift, **options)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray, self._last, there, there - self._shift, **options)
+    def _move(self, gray: Gray) -> None:
+        there, found = _flow(self._last, gray, self._uv, self._shift)
+        back, found_back = _flow(gray, self._last, there, -self._shift)
         high = np.array([gray.shape[1], gray.shape[0]]) - 1 - _EDGE_PX
-        with np.errstate(invalid="ignore"):  # lost features may be anywhere
-            good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm(back - self._uv, axis=-1) < _BACK_PX)
-            good &= np.all((there >= _EDGE_PX) & (there <= high), axis=-1)
+        good = found & found_back & (np.linalg.norm(back - self._uv, axis=-1) < _BACK_PX)
+        good &= np.all((there >= _EDGE_PX) & (there <= high), axis=-1)
         there, number, shift = there[good], self._number[good], (there - self._uv)[good]
         # Two that have run together are one: the older stays.
         _, alone = np.unique(np.floor(there / (_SPACING_PX / 2)), axis=0, return_index=True)
         alone.sort()
         self._uv, self._number, self._shift = there[alone], number[alone], shift[alone]
 
-    def _add(self, gray: NDArray[np.uint8]) -> None:
+    def _add(self, gray: Gray) -> None:
         """Fill the cells that have less than their share with the strongest corners (Shi and Tomasi 1994) away from the features there."""
         height, width = gray.shape
         need = self._quota - np.bincount(self._cell(self._uv, width, height), minlength=_CELLS[0] * _CELLS[1])

@@ -1,7 +1,7 @@
 """Rotation between two views from matched rays, the translation eliminated: many pairs at once, padded to the same number of points.
 
-With g = R f_2 (R = R_1_2), e = J g the displacement in px of image 1 (J = duv/dray at f_1, so J f_1 = 0) and d = J t where the epipolar line
-points, the residual is the displacement across that line in units of one coordinate's noise in one image,
+With g = R f_2 (R = R_1_2), e = J g the displacement in px of image 1 (J = duv/dray at f_1, so J f_1 = 0) and d = J t, where the
+epipolar line points, the residual is the displacement across that line, scaled to have one coordinate's noise in one image,
     s = (e_x d_y - e_y d_x) / (sqrt(2) |d|),
 zero exactly where f_1, g and t are coplanar: the maximum likelihood of (R, t) for pixel noise (Sampson 1982; Kanatani 1996), depths free.
 Shapes: p pairs, n points, s starts. Rays (p, 3, n), J (p, 2, 3, n), weights (p, n).
@@ -95,7 +95,8 @@ def scale(size: Array, given: Array) -> Array:
     """Return the median of sizes (p, n) over the points that are given, (p,)."""
     ordered = np.sort(np.where(given > 0, size, np.inf), axis=-1)
     middle = (given.sum(axis=-1).astype(int) // 2).clip(0, size.shape[1] - 1)
-    return np.maximum(np.take_along_axis(ordered, middle[:, None], axis=-1)[:, 0], 1e-12)
+    out: Array = np.maximum(np.take_along_axis(ordered, middle[:, None], axis=-1)[:, 0], 1e-12)
+    return out
 
 
 def sigma_of(across: Array, given: Array) -> Array:
@@ -207,7 +208,8 @@ def choose(m: Matches, candidates: list[tuple[Array, Array]]) -> tuple[Array, Ar
 def two_fold(m: Matches, R: Array, t: Array, keep: Array) -> Mask:
     """Return where (p,) another solution fits as well: on a plane, whose inverse distances are a . g, (a, t) and (t, a) make the same flow.
 
-    The other rotation differs (Longuet-Higgins 1984), and only points that it puts behind the cameras, t . g < 0, tell it from the true one.
+    The other rotation differs (Longuet-Higgins 1984), and only points that it puts behind the cameras, t . g < 0, tell it
+    from the true one.
     """
     r = residuals(m, R, t)
     n = np.maximum(keep.sum(axis=-1), 6)
@@ -230,7 +232,7 @@ def _chi_squared(across: Array, along: Array, given: Array, sigma: Array) -> Arr
 
 
 def agreeing(m: Matches, R: Array, t: Array) -> Array:
-    """Return 1 for the points (p, n) that are within CUT sigmas of their epipolar line, not farther behind the cameras, and whose track mostly is."""
+    """Return 1 for points (p, n) within CUT sigmas of their epipolar line, no farther behind the cameras, as is most of their track."""
     r = residuals(m, R, t)
     sigma = sigma_of(r.across, m.given)[:, None]
     alone = m.given * (np.abs(r.across) < CUT * sigma) * (r.along > -CUT * sigma)
@@ -255,9 +257,9 @@ class Trust:
 def trust(m: Matches, R: Array, t: Array, keep: Array) -> Trust:
     """Return the covariance A^-1 B A^-1 sigma^2 and what it is made of, on the points kept.
 
-    B = sum J J^T. As depths come from the same noisy points, the expected Hessian lacks their noise, A = B - sigma^2 sum (d phi/dt)(d phi/dt)^T
-    in the translation's block, phi the line's direction: d^2 (s^2/2) / d phi^2 = along^2 - across^2 (incidental parameters, Neyman and
-    Scott 1948).
+    B = sum J J^T. Depths come from the same noisy points; the expected Hessian A lacks their noise in the translation's block,
+    A = B - sigma^2 sum (d phi/dt)(d phi/dt)^T with phi the line's direction, for d^2 (s^2/2) / d phi^2 = along^2 - across^2
+    (incidental parameters, Neyman and Scott 1948).
     """
     r, basis = residuals(m, R, t), tangent_basis(t)
     J = jacobian(r, basis)

@@ -1,6 +1,7 @@
 """Turns of a camera from feature tracks, without a board: from frame to frame, the translation eliminated.
 
-Consecutive frames only: longer steps were no better (docs of the errors in `turns_of_tracks`), and overlapping ones are not independent.
+Consecutive frames only: errors that frames share cancel along the chain, so longer steps gain little, and overlapping ones are not
+independent.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ Rows = NDArray[np.intp]
 _CHUNK = 128  # pairs at once: memory stays flat, arrays in the cache
 _STARTS = 3
 _STEPS = 4
-_FEWEST = 25  # points: five unknowns, wrong tracks and a scatter to be estimated
+_FEWEST = 25  # points: five unknowns, wrong tracks, and a scatter to be estimated
 _FEWEST_SHARE = 0.4  # of the points of a pair; where fewer agree, something else moves
 _LEAST_PARALLAX = 2.5  # sigmas; below, the direction of the translation is noise, and the rotation with it
 _LARGEST_SIGMA = 0.02  # rad, of a turn that tells anything
@@ -62,9 +63,9 @@ class _Solved:
 def turns_of_tracks(tracks: FeatureTracks, camera: Camera, plain: bool = False) -> Turns:
     """Return how the camera turned from frame to frame, in its own axes: exp(hat(angle)) = R_w_c(i)^T R_w_c(i + 1).
 
-    The lens must be calibrated. `own_cov` and `end_cov` come from the scatter of the points about their epipolar lines, and from how much of
-    that scatter two adjacent pairs share (the noise of the frame between them; a tracker's steps share nothing).
-    Pairs of which the points do not tell the turn are left out.
+    The lens must be calibrated. `own_cov` and `end_cov` come from the scatter of the points about their epipolar lines, and from how
+    much of it two adjacent pairs share (the noise of the frame between them; a tracker's steps share nothing). Left out are pairs of
+    which the points do not tell the turn: too few, at odds, or on a plane that has two solutions.
 
     `plain` takes the points' velocity as that of a rotation alone, u' = A(u) omega, f * gyro near the centre (least squares, robust):
     beside near things it is biased, by 0.3-5 ms of time offset at 0.9 m.

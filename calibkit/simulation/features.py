@@ -28,13 +28,15 @@ class Scene:
 
 def _room(scene: Scene, origin_w: Array, rays_w: Array, rng: np.random.Generator) -> Array:
     """Return distances (k,) m along rays: a cloud of things, as many per doubling of the distance."""
-    return np.exp(rng.uniform(np.log(scene.near), np.log(scene.far), len(rays_w)))
+    distance: Array = np.exp(rng.uniform(np.log(scene.near), np.log(scene.far), len(rays_w)))
+    return distance
 
 
 def _wall(scene: Scene, origin_w: Array, rays_w: Array, rng: np.random.Generator) -> Array:
     """Return distances (k,) m to a flat wall that the resting rig looks at from `near`; what misses it is `far`."""
     ahead = np.maximum(rays_w[:, 0], 1e-9)  # the rig rests looking along world +x
-    return np.minimum((scene.near - origin_w[0]) / ahead, scene.far)
+    distance: Array = np.minimum((scene.near - origin_w[0]) / ahead, scene.far)
+    return distance
 
 
 SCENES: dict[str, Callable[[Scene, Array, Array, np.random.Generator], Array]] = {"room": _room, "wall": _wall}

@@ -1,5 +1,6 @@
 """Where a board was before a camera whose lens is known: each frame's pose with its covariance, or why it has none."""
 
+from collections import Counter
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -50,7 +51,8 @@ class _Slab:
     scale: Array  # (f,) noise by the median residual, inf where there is no pose
     chi2: Array  # (f,) over the kept corners
     px2: Array  # (f,) likewise, px^2
-    count: NDArray[np.intp]  # (f,) kept corners
+    found: NDArray[np.intp]  # (f,) corners
+    count: NDArray[np.intp]  # (f,) and how many of them are kept
     ambiguous: Mask  # (f,)
     kept: Mask  # (n,) rows
 
@@ -63,21 +65,27 @@ def board_poses(views: BoardViews, camera: Camera) -> BoardPoses:
     """
     model, lens = _lens_of(camera, views)
     step = max(1, _SLAB_POINTS // len(views.board.points))
-    slabs = [_pose_slab(_part(views, start, start + step), model, lens) for start in range(0, max(views.n_frames, 1), step)]
+    slabs = [_pose_slab(_part(views, start, start + step), model, lens) for start in range(0, views.n_frames, step)]
+    if not slabs:
+        raise _nothing(views, "no image shows the board")
     every = _Slab(**{field.name: np.concatenate([getattr(slab, field.name) for slab in slabs]) for field in fields(_Slab)})
+
     posed = np.isfinite(every.scale) & (every.count >= MIN_CORNERS)
     if not posed.any():
-        raise BadInputError(f"{views.camera}: no image gives a board pose: check the target file and the lens against the images")
-
+        raise _nothing(views, f"no image has {MIN_CORNERS} corners that fit one")
     typical = max(float(np.median(every.scale[posed])), _FINEST)
     times = every.scale / typical
     quiet = posed & (times <= NOISY_VIEW)
-    noise = max(float(np.sqrt(every.chi2[quiet].sum() / np.sum(2 * every.count[quiet] - 6))), _FINEST)
+    freedom = float(np.sum(2 * every.count[quiet] - 6))
+    noise = max(float(np.sqrt(every.chi2[quiet].sum() / freedom)), _FINEST)
     cov = every.cov * (noise * np.maximum(np.where(posed, times, 0.0) / NOISY_VIEW, 1.0))[:, None, None] ** 2
 
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, -1], 0.0))
-    why = _reasons(views, every, times, sigma)
+    why = _reasons(every, times, sigma)
     good = np.array([not reason for reason in why])
+    if not good.any():
+        reason, images = Counter(why).most_common(1)[0]
+        raise _nothing(views, f"{images} of {len(why)} images: {reason}")
     count = every.count[good]
     return BoardPoses(
         camera=views.camera,
@@ -90,8 +98,12 @@ def board_poses(views: BoardViews, camera: Camera) -> BoardPoses:
         n_corners=count,
         kept=every.kept & good[views.frame],
         dropped=tuple(DroppedView(views.camera, label, reason) for label, reason in zip(views.labels, why, strict=True) if reason),
-        sigma_px=noise * float(np.median(views.sigma_px)),
+        sigma_px=float(np.sqrt(every.px2[quiet].sum() / freedom)),
     )
+
+
+def _nothing(views: BoardViews, why: str) -> BadInputError:
+    return BadInputError(f"{views.camera}: no board poses ({why}): check the target file and the lens against the images")
 
 
 def _lens_of(camera: Camera, views: BoardViews) -> tuple[CameraModel, Array]:
@@ -155,22 +167,22 @@ def _pose_slab(views: BoardViews, model: CameraModel, lens: Array) -> _Slab:
         scale=scale,
         chi2=np.sum(squares * grid.weight**2, axis=1),
         px2=squares.sum(axis=1),
+        found=np.sum(grid.weight > 0, axis=1),
         count=kept.sum(axis=1),
         ambiguous=found.ambiguous,
         kept=kept[views.frame, views.corner],
     )
 
 
-def _reasons(views: BoardViews, every: _Slab, times: Array, sigma: Array) -> list[str]:
+def _reasons(every: _Slab, times: Array, sigma: Array) -> list[str]:
     """Return why each frame is not to be used, or nothing."""
-    found = np.bincount(views.frame, minlength=views.n_frames)
-    why = [""] * views.n_frames
+    why = [""] * len(times)
     cases = [
         (sigma > _LOOSEST, "its corners hardly tell the board's orientation"),
-        (every.ambiguous, "ambiguous: the board tilted the other way fits as well"),
+        (every.ambiguous, "ambiguous: the board tilted the other way fits as well; hold it nearer, or take a larger one"),
         (every.count < MIN_CORNERS, f"fewer than {MIN_CORNERS} corners fit one pose"),
         (times > BAD_VIEW, ""),
-        (found < MIN_CORNERS, f"fewer than {MIN_CORNERS} corners"),
+        (every.found < MIN_CORNERS, f"fewer than {MIN_CORNERS} corners"),
     ]
     for frames, text in cases:  # the last one says it
         for i in np.flatnonzero(frames):

@@ -4,7 +4,7 @@ A flat board that is small or far looks the same tilted towards the camera and a
 (Schweighofer and Pinz 2006), and only perspective tells them apart.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from calibkit.estimation.camera_problem import CameraViews
 from calibkit.estimation.flat_views import FlatViews, Weigh
 from calibkit.estimation.lens_fit import MIN_CORNERS, OUTLIER
-from calibkit.estimation.lens_seed import poses_from_rays, robust_poses_of_views
+from calibkit.estimation.lens_seed import poses_from_rays
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
 _FINEST = 1e-3  # sigmas: below, |r|^2 is the rounding of its sum
 _MEDIAN = np.sqrt(2 * np.log(2))  # of a Rayleigh distribution, in sigmas per coordinate
-_PULLS, _CUTS = 5, 2
+_PULLS, _CUTS, _MANY_CUTS = 5, 2, 10  # many where a start may be far off
+_DRAWS = 24  # a third of the corners may be wrong: one view in 200 has then no draw without one
 _PART = 32  # corners of a view that are enough to start from
 _SUSPECT = 2.0  # times the views' median noise: seeded anew
-_BETTER = 30.0  # chi-squared by which a pose must beat its reflection: chance in 3 of 10 million
-_FAR = 500.0  # the same before the reflection is refined: what refinement takes is less than the rest
+_BETTER = 30.0  # chi-squared by which a pose must beat its reflection: exp(-15) of the likelihood is left to that
+_FAR = 500.0  # the same before the reflection is refined, which takes most of what can be taken but not nine tenths
 _SAME = 9.0  # chi-squared between two poses that the covariance takes for one
 
 Mask = NDArray[np.bool_]
@@ -45,22 +46,25 @@ def flat_poses(views: CameraViews, lens: Array, points: Array) -> FlatPoses:
     start = poses_from_rays(np.swapaxes(part.ray, 1, 2), part.seen, part.points).T_cam_board
     T, scale = _settle(flat, _pulled(part, start))
     typical = _typical(scale)
-
     suspect = np.flatnonzero(np.isfinite(scale) & (scale > _SUSPECT * typical))
     if len(suspect):
-        rows = replace(views, instant=views.instant[suspect], uv=views.uv[suspect], weight=views.weight[suspect])
-        start = _pulled(flat.rows(suspect), robust_poses_of_views(rows, lens, points).T_cam_board)
-        again, its_scale = _settle(flat.rows(suspect), start, typical)
+        rows = flat.rows(suspect)
+        again, its_scale = _settle(rows, _pulled(rows, _drawn(rows)), typical, _MANY_CUTS)
         better = its_scale < scale[suspect]
         T[suspect[better]], scale[suspect[better]] = again[better], its_scale[better]
+    ambiguous = _choose(flat, T, scale, typical)
+    return FlatPoses(T, scale, flat.seen & (flat.squares(T) <= _limit(scale, typical)), ambiguous)
 
-    noise = np.where(np.isfinite(scale), np.maximum(scale, typical), np.inf)
+
+def _choose(flat: FlatViews, T: Array, scale: Array, typical: float) -> Mask:
+    """Put the reflected pose in the place of one that fits worse, in T and scale; return where neither is clearly better."""
+    noise = np.maximum(scale, typical)
     other, ambiguous = _reflected(flat, T), np.zeros(len(T), bool)
     in_doubt = (_cost(flat, other, noise) - _cost(flat, T, noise) < _FAR) | (scale > _SUSPECT * typical)
     near = np.flatnonzero(in_doubt & np.isfinite(scale))
     if len(near):
         T[near], scale[near], ambiguous[near] = _told_apart(flat.rows(near), T[near], other[near], typical)
-    return FlatPoses(T, scale, flat.seen & (flat.squares(T) <= _limit(scale, typical)), ambiguous)
+    return ambiguous
 
 
 def _pulled(flat: FlatViews, T: Array) -> Array:
@@ -70,12 +74,27 @@ def _pulled(flat: FlatViews, T: Array) -> Array:
     return T
 
 
-def _settle(flat: FlatViews, T: Array, typical: float | None = None) -> tuple[Array, Array]:
+def _drawn(flat: FlatViews) -> Array:
+    """Return for each view the pose of four corners, among some draws of four, that has the least median of |r| (Rousseeuw 1984)."""
+    rng = np.random.default_rng(0)
+    rays = np.swapaxes(flat.ray, 1, 2)
+    T, best = np.tile(np.eye(4), (len(rays), 1, 1)), np.full(len(rays), np.inf)
+    for _ in range(_DRAWS):
+        lot = np.where(flat.seen, rng.random(flat.seen.shape), np.inf)
+        four = lot <= np.partition(lot, 3, axis=1)[:, 3:4]
+        drawn = poses_from_rays(rays, four & flat.seen, flat.points).T_cam_board
+        scale = _scales(flat, drawn)
+        better = scale < best
+        T[better], best[better] = drawn[better], scale[better]
+    return T
+
+
+def _settle(flat: FlatViews, T: Array, typical: float | None = None, cuts: int = _CUTS) -> tuple[Array, Array]:
     """Return poses by least squares without what lies beyond 4.5 sigmas, and their scales, from a good start.
 
     `typical` is the least noise that a view is believed to have: without it, the median of these views' own.
     """
-    for _ in range(_CUTS):
+    for _ in range(cuts):
         scale = _scales(flat, T)
         limit = _limit(scale, _typical(scale) if typical is None else typical)
         T = flat.step(T, _within(limit))
@@ -120,14 +139,15 @@ def _reflected(flat: FlatViews, T: Array) -> Array:
     """
     middle = flat.seen @ flat.points / np.maximum(flat.seen.sum(axis=1), 1)[:, None]
     centre = (T[:, :3, :3] @ middle[:, :, None])[..., 0] + T[:, :3, 3]
-    v = centre / np.linalg.norm(centre, axis=1, keepdims=True)
+    v = centre / np.maximum(np.linalg.norm(centre, axis=1, keepdims=True), 1e-300)
     R = (np.eye(3) - 2 * v[:, :, None] * v[:, None, :]) @ T[:, :3, :3] * np.array([1.0, 1.0, -1.0])
     return se3.make(R, centre - (R @ middle[:, :, None])[..., 0])
 
 
 def _told_apart(flat: FlatViews, T: Array, other: Array, typical: float) -> tuple[Array, Array, Mask]:
     """Return the better one of two poses of each view, its scale, and whether the other one is as good, and another."""
-    (T, scale), (other, its_scale) = _settle(flat, T, typical), _settle(flat, _pulled(flat, other), typical)
+    T, scale = _settle(flat, T, typical, _MANY_CUTS)
+    other, its_scale = _settle(flat, _pulled(flat, other), typical, _MANY_CUTS)
     noise = np.maximum(np.minimum(scale, its_scale), typical)
     gain = _cost(flat, other, noise) - _cost(flat, T, noise)
     swap = gain < 0

@@ -336,6 +336,7 @@ def test_degenerate_motions_are_finite_and_seen(name: str, noise: bool) -> None:
     if noise:
         A = with_noise(A, np.random.default_rng(10), 1e-3, 1e-3)
     results = [solve(A, B, None) for solve in (*METHODS.values(), *SEEDS.values())]
+    results += [solve(A, B, np.zeros(len(A))) for solve in (*METHODS.values(), *SEEDS.values())]
     results += [T for solve in WORLD_METHODS.values() for T in solve(A, B, None)]
     for X in results:
         assert np.isfinite(X).all()

@@ -47,12 +47,11 @@ SEEDS: dict[int, Solver] = {0: no_axis, 1: one_axis, 2: park, 3: park}
 
 
 def _turn(b: Array, a: Array) -> Array:
-    """Return a rotation that carries b's direction to a, for b of any length and a of length 1: a half turn about the middle of the two.
+    """Return a rotation that carries b's direction to a, for b of any length, 0 too, and a of length 1: a half turn about their middle.
 
     Where they point apart, b is first turned by 180 deg about an axis across a.
     """
-    length = np.linalg.norm(b, axis=-1, keepdims=True)
-    b = np.where(length > 0, b / np.maximum(length, 1e-300), a)
+    b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-300)
     first = np.where(
         np.sum(a * b, axis=-1)[..., None, None] < 0, _half_turn(np.cross(a, np.eye(3)[np.argmin(np.abs(a), axis=-1)])), np.eye(3)
     )

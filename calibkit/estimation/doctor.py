@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.plural import counted
+from calibkit.estimation.stamps import StampReport, check_stamps
 from calibkit.geometry import so3
 from calibkit.models.imu import STANDARD_GRAVITY
 
@@ -16,11 +17,14 @@ Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 G = STANDARD_GRAVITY.value
 
-_GAP = 1.75  # median intervals; above, a sample or more is missing
+_GAP = 1.75  # periods; above, a sample or more is missing
 _DAY_S = 86400  # clocks further apart do not count from the same epoch
 _LONG_GAP_S = 0.2  # above, interpolation across a gap is a guess even for a hand-held rig
 _MAX_HZ = 1e5  # above, no sensor of a rig
-_JITTER = 0.1  # robust sigma of the interval over its median
+_JITTER, _NOTED = 0.07, 0.02  # of the period; rms of the stamps around a regular grid, above which it is a problem, and worth telling
+_NOISY = 0.05  # of the period; above, a single interval that is off may be jitter beside a missing sample
+_FAR = 6.0  # sigmas of jitter
+_SHARE, _MANY = 0.01, 0.05  # of the samples that are missing: worth telling, a problem
 _CLOCKS_S = 0.1  # latencies of two sensors differ by more: one clock is wrong
 _FROZEN = 0.01  # share of samples that repeat the one before
 _DARK = 0.08  # mean over full scale
@@ -38,45 +42,60 @@ class Finding:
 
 
 def rate_hz(t_ns: Times) -> float | None:
-    """Return the rate by the median interval; None where times do not advance."""
+    """Return the rate that the sensor ticks at, else that of the median interval; None where times do not advance."""
     steps = np.diff(t_ns)
     steps = steps[steps > 0]
-    return float(1e9 / np.median(steps)) if len(steps) else None
+    return check_stamps(t_ns).rate_hz or (float(1e9 / np.median(steps)) if len(steps) else None)
 
 
 def check_times(t_ns: Times) -> list[Finding]:
-    """Find disorder, duplicates, gaps, single wrong stamps and jitter in the times of one stream."""
+    """Find disorder, duplicates, gaps, single wrong stamps, bursts and jitter in the times of one stream."""
     found = []
-    rate = rate_hz(t_ns)
+    report, rate = check_stamps(t_ns), rate_hz(t_ns)
     if rate is not None and rate > _MAX_HZ:
         found.append(Finding("rate", True, f"{rate:.3g} Hz is no sensor's rate: stamps in the wrong unit?"))
     steps = np.diff(t_ns) * 1e-9
-    back, same = int(np.sum(steps < 0)), int(np.sum(steps == 0))
-    if back:
-        found.append(Finding("disorder", True, f"{counted(back, 'stamp goes', 'stamps go')} back in time, by up to {-steps.min():.6g} s"))
+    same = int(np.sum(steps == 0))
+    if report.backward:
+        stamps = counted(report.backward, "stamp goes", "stamps go")
+        found.append(Finding("disorder", True, f"{stamps} back in time, by up to {-steps.min():.6g} s"))
     if same:
         found.append(Finding("duplicate", True, f"{counted(same, 'stamp repeats', 'stamps repeat')} the one before"))
-    steps = steps[steps > 0]
-    if len(steps) < 10:
+    if rate is None or np.sum(steps > 0) < 10:
         return found
-    typical = float(np.median(steps))
-    spread = _MAD * float(np.median(np.abs(steps - typical)))
-    missing = steps > max(_GAP * typical, typical + 6 * spread)
-    if missing.any():
-        longest = int(np.argmax(np.diff(t_ns)))
-        at, length = (t_ns[longest] - t_ns[0]) * 1e-9, (t_ns[longest + 1] - t_ns[longest]) * 1e-9
-        lost = int(np.sum(np.rint(steps[missing] / typical) - 1))
-        gaps, samples = counted(int(np.sum(missing)), "gap", "gaps"), counted(lost, "sample", "samples")
-        text = f"{gaps}, about {samples} missing; the longest {length:.3g} s at {at:.3f} s from the start"
-        found.append(Finding("gap", bool(length > max(_LONG_GAP_S, 5 * typical)), text))
-    odd = (np.abs(steps - typical) > max(8 * spread, 0.25 * typical)) & ~missing
-    if odd.any() and spread < _JITTER * typical:
-        intervals = counted(int(np.sum(odd)), "interval is", "intervals are")
-        found.append(Finding("irregular", True, f"{intervals} off by more than {max(8 * spread, 0.25 * typical):.3g} s"))
-    if spread >= _JITTER * typical:
-        found.append(
-            Finding("jitter", True, f"intervals scatter by {spread * 1e3:.3g} ms around {typical * 1e3:.4g} ms: stamped on arrival?")
-        )
+    if report.bursts:
+        found.append(Finding("bursts", True, "stamps come in bursts: they are times of arrival, not of the sensor"))
+    gaps = steps > max(_GAP / rate, 1 / rate + _FAR * 2**0.5 * (report.jitter_s or 0.0))
+    return found + _gaps(t_ns, report, 1 / rate, gaps) + _uneven(steps[(steps > 0) & ~gaps], report, 1 / rate)
+
+
+def _gaps(t_ns: Times, report: StampReport, period: float, gaps: NDArray[np.bool_]) -> list[Finding]:
+    steps = np.diff(t_ns) * 1e-9
+    if not gaps.any():
+        return []
+    longest = int(np.argmax(steps))
+    at, length = (t_ns[longest] - t_ns[0]) * 1e-9, steps[longest]
+    lost = int(np.sum(np.rint(steps[gaps] / period) - 1)) if report.empty is None else report.empty
+    text = f"{counted(int(np.sum(gaps)), 'gap', 'gaps')}, about {counted(lost, 'sample')} missing"
+    if report.missing_share >= _SHARE:
+        text += f" ({100 * report.missing_share:.0f} % of {report.expected}, the rate is {1 / period:.4g} Hz)"
+    problem = length > max(_LONG_GAP_S, 5 * period) or report.missing_share >= _MANY
+    return [Finding("gap", bool(problem), f"{text}; the longest {length:.3g} s at {at:.3f} s from the start")]
+
+
+def _uneven(steps: Array, report: StampReport, period: float) -> list[Finding]:
+    """Find jitter, and intervals that are off the grid by far more than it."""
+    if report.jitter_s is None:
+        return []
+    jitter, found = report.jitter_s, []
+    off = np.abs(steps - period)
+    limit = max(_FAR * _MAD * float(np.median(off)) if len(off) else 0.0, 0.25 * period)
+    if (odd := int(np.sum(off > limit))) and jitter < _NOISY * period:
+        found.append(Finding("irregular", True, f"{counted(odd, 'interval is', 'intervals are')} off by more than {limit:.3g} s"))
+    if jitter >= _NOTED * period:
+        text = f"stamps jitter by {jitter * 1e3:.2g} ms rms around {period * 1e3:.4g} ms"
+        late = jitter >= _JITTER * period
+        found.append(Finding("jitter", late, f"{text}: stamped on arrival?" if late else text))
     return found
 
 

@@ -1,0 +1,169 @@
+"""The stamps of one stream against the regular grid that its sensor ticked on: period, missing ones, repeats, jitter, bursts.
+
+The period is found in the phases of intervals, exp(2 pi i d / P), which neither missing stamps nor jitter of a fifth of it hide; the
+jitter is what is left in short blocks, each with a phase of its own, so that a drifting or jumping clock does not count as jitter.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.data.plural import counted
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+_LEAST = 10  # stamps; fewer are no grid
+_BLOCK = 32  # stamps that share a phase
+_MANY = 20_000  # intervals that are enough to tell the period
+_UNSET_S = 1000.0  # a zero stamp so far before all others is none
+_LONG_S, _LONG = 1.0, 1e-3  # intervals above both, the second a share of the duration, are gaps of the recording
+_FINEST, _COARSEST = 1 / 8, 2.0  # of the median interval: periods that are tried
+_ALIKE = 0.8  # of the best coherence; a multiple of the best period that is as coherent is the period
+_COHERENT = 0.3  # mean resultant length of a block; jitter of a quarter of the period leaves 0.29, no grid 0.16
+_BURST, _IN_BURSTS = 0.2, 0.4  # of the mean interval; share of intervals below it
+_TOLD = 0.005  # of the period: less jitter is not worth a sentence
+_FAR = 4.0  # sigmas: stamps further off are wrong, and no jitter
+
+
+@dataclass(frozen=True)
+class StampReport:
+    """What the stamps of a stream say of themselves; None where they follow no grid."""
+
+    count: int
+    period_s: float | None  # of the sensor, also where most of its frames are missing
+    empty: int | None  # ticks of the grid without a stamp, from the first stamp to the last
+    duplicates: int  # stamps that another frame has, too
+    zeros: int  # stamps that are not set
+    backward: int  # stamps before the one before
+    jitter_s: float | None  # rms of the stamps around the grid
+    jitter_sigma_s: float | None
+    bursts: bool  # several at once, then none: times of arrival
+
+    @property
+    def rate_hz(self) -> float | None:
+        return None if self.period_s is None else 1 / self.period_s
+
+    @property
+    def missing(self) -> int:
+        """Ticks without a frame, 0 where that is not known: a frame with a repeated or zero stamp was one, too."""
+        return max(0, (self.empty or 0) - self.duplicates - self.zeros)
+
+    @property
+    def expected(self) -> int:
+        """Frames with those that are missing."""
+        return self.count + self.missing
+
+    @property
+    def missing_share(self) -> float:
+        return self.missing / max(self.expected, 1)
+
+
+def check_stamps(t_ns: Times) -> StampReport:
+    """Return what the stamps (n,) of a stream, in the order of the recording, say of themselves."""
+    zeros = _unset(t_ns)
+    stamps = t_ns[~zeros]
+    ordered = np.sort(stamps)
+    unique = ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+    backward = int(np.sum(np.diff(stamps) < 0))
+    t_s = (unique - unique[0]) * 1e-9 if len(unique) else np.zeros(0)
+    bursts = _in_bursts(t_s)
+    period = _period(t_s) if len(t_s) >= _LEAST and not bursts else None
+    empty = jitter = sigma = None
+    if period is not None:
+        offset, coherence = _phases(t_s, period)
+        ticks = int(np.rint(t_s[-1] / period - offset[-1]) - np.rint(t_s[0] / period - offset[0])) + 1
+        if coherence < _COHERENT:
+            period = None
+        else:
+            empty = max(0, ticks - len(unique))
+            jitter, sigma = _jitter(t_s, period, offset)
+    return StampReport(len(t_ns), period, empty, len(stamps) - len(unique), int(np.sum(zeros)), backward, jitter, sigma, bursts)
+
+
+def _unset(t_ns: Times) -> NDArray[np.bool_]:
+    zero = t_ns == 0
+    others = t_ns[~zero]
+    return zero if len(others) == 0 or np.min(np.abs(others)) > _UNSET_S * 1e9 else np.zeros(len(t_ns), np.bool_)
+
+
+def _between_gaps(t_s: Array) -> Array:
+    steps = np.diff(t_s)
+    out: Array = steps[steps <= max(_LONG_S, _LONG * t_s[-1])]
+    return out
+
+
+def _in_bursts(t_s: Array) -> bool:
+    if len(t_s) < _LEAST or not len(steps := _between_gaps(t_s)):
+        return False
+    return bool(np.mean(steps < _BURST * np.mean(steps)) > _IN_BURSTS)
+
+
+def _period(t_s: Array) -> float:
+    """Return the period of the grid: the largest that the intervals are whole multiples of, sharpened over ever longer spans."""
+    steps = np.diff(t_s)[:: max(1, len(t_s) // _MANY)]
+    typical = float(np.median(steps))
+    steps = steps[steps < 8 * typical]
+    tried = typical * np.geomspace(_FINEST, _COARSEST, 500)
+    coherence = np.array([_coherence(steps, period) for period in tried])
+    best = float(tried[np.argmax(coherence)])
+    multiples = [
+        best * m
+        for m in range(1, round(_COARSEST / _FINEST) + 1)
+        if best * m <= tried[-1] and _coherence(steps, best * m) >= _ALIKE * coherence.max()
+    ]
+    period, lag = multiples[-1], 1
+    while lag <= min(2 * _BLOCK, len(t_s) // 4):
+        first = np.arange(0, len(t_s) - lag, max(1, len(t_s) // _MANY))
+        spans = t_s[first + lag] - t_s[first]
+        spans = spans[spans < 8 * typical * lag] / period
+        turn = np.angle(np.mean(np.exp(2j * np.pi * spans))) / (2 * np.pi)
+        period *= 1 + float(turn / np.mean(spans))
+        lag *= 2
+    return period
+
+
+def _coherence(steps: Array, period: float) -> float:
+    """Return 1 where all steps are multiples of the period, 0 for any steps, -1 for halves."""
+    return float(np.mean(np.cos(2 * np.pi / period * steps)))
+
+
+def _phases(t_s: Array, period: float) -> tuple[Array, float]:
+    """Return the grid's offset at each stamp in periods (n,), the same within a block, and the mean coherence of a block."""
+    block = np.minimum(np.arange(len(t_s)) // _BLOCK, max(len(t_s) // _BLOCK, 1) - 1)
+    phasor = np.exp(2j * np.pi * (t_s / period))
+    mean = (np.bincount(block, phasor.real) + 1j * np.bincount(block, phasor.imag)) / np.bincount(block)
+    offset: Array = np.unwrap(np.angle(mean))[block] / (2 * np.pi)
+    return offset, float(np.mean(np.abs(mean)))
+
+
+def _jitter(t_s: Array, period: float, offset: Array) -> tuple[float, float]:
+    """Return the rms of the stamps around the grid in s, and its sigma; wrong stamps apart."""
+    off = t_s / period - offset
+    off = (off - np.rint(off)) * period
+    spread = 1.4826 * float(np.median(np.abs(off)))
+    good = off[np.abs(off) <= _FAR * spread] if spread > 0 else off
+    freedom = len(good) * (1 - 1 / _BLOCK)  # each block has a phase of its own
+    rms = float(np.sqrt(np.sum(good**2) / max(freedom, 1)))
+    return rms, rms / float(np.sqrt(2 * max(freedom, 1)))
+
+
+def describe(report: StampReport, noun: str = "frame") -> list[str]:
+    """Return what is wrong with the stamps, in sentences; `noun` is what has a stamp."""
+    said = []
+    rate = f", the rate is {report.rate_hz:.4g} Hz" if report.rate_hz else ""
+    if report.missing:
+        said.append(f"{100 * report.missing_share:.2g} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
+    if report.duplicates:
+        said.append(f"{counted(report.duplicates, f'{noun} has', f'{noun}s have')} the stamp of another")
+    if report.zeros:
+        said.append(f"{counted(report.zeros, f'{noun} has', f'{noun}s have')} a stamp of zero")
+    if report.backward:
+        said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time")
+    if report.period_s and report.jitter_s and report.jitter_sigma_s and report.jitter_s > _TOLD * report.period_s:
+        size = f"{report.jitter_s * 1e3:.2g} +- {report.jitter_sigma_s * 1e3:.1g}"
+        said.append(f"stamps jitter by {size} ms rms around a regular grid{rate if not report.missing else ''}")
+    if report.bursts:
+        said.append("stamps come in bursts: they are times of arrival, not of the sensor")
+    return said

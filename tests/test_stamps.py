@@ -1,0 +1,116 @@
+"""Stamps against the grid of their sensor: period, missing frames, jitter, repeats and bursts, each with its size."""
+
+import numpy as np
+import pytest
+
+from calibkit.estimation import doctor
+from calibkit.estimation.stamps import check_stamps, describe
+from calibkit.simulation.faults import apply_faults
+from calibkit.simulation.scenarios import SCENARIOS
+from calibkit.simulation.session import simulate_session
+
+T0 = 1_700_000_000_000_000_000
+
+
+def _stamps(n: int, hz: float, jitter_s: float = 0.0, drops: float = 0.0, seed: int = 0) -> tuple[np.ndarray, int]:
+    """Return stamps, and how many were lost between the first and the last."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / hz + rng.normal(size=n) * jitter_s
+    kept = np.flatnonzero(rng.random(n) >= drops)
+    return T0 + np.rint(t[kept] * 1e9).astype(np.int64), int(np.ptp(kept)) + 1 - len(kept)
+
+
+@pytest.mark.parametrize("drops", [0.0, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("jitter", [0.0, 0.004, 0.04, 0.1, 0.2])
+def test_the_period_and_the_share_missing_are_found_whatever_is_lost(jitter: float, drops: float) -> None:
+    for seed, (n, hz) in enumerate([(1400, 20.0), (900, 30.0), (12000, 200.0), (1400, 29.97)]):
+        t_ns, lost = _stamps(n, hz, jitter / hz, drops, seed)
+        report = check_stamps(t_ns)
+        assert report.rate_hz == pytest.approx(hz, rel=1e-9 + 0.005 * jitter)
+        assert abs(report.missing - lost) <= (1 if jitter == 0.2 else 0)
+        assert report.jitter_s * hz == pytest.approx(jitter, abs=4 * report.jitter_sigma_s * hz + 0.03 * jitter + 1e-6)
+        assert doctor.rate_hz(t_ns) == report.rate_hz
+
+
+def test_two_ms_of_jitter_reads_two_ms_and_its_sigma_is_honest() -> None:
+    reports = [check_stamps(_stamps(1400, 20, 2e-3, 0.3, seed)[0]) for seed in range(40)]
+    off = np.array([report.jitter_s - 2e-3 for report in reports])
+    assert np.abs(off).max() < 0.15e-3
+    assert 0.65 < np.sqrt(np.mean((off / [report.jitter_sigma_s for report in reports]) ** 2)) < 1.38
+
+
+def test_a_clock_that_drifts_or_jumps_or_a_long_gap_is_no_jitter() -> None:
+    t_ns, _ = _stamps(1400, 20, 2e-3)
+    seconds = (t_ns - T0) * 1e-9
+    for late in (seconds * 200e-6, np.where(seconds > 35, 0.033, 0), 2e-3 * np.sin(seconds / 5), np.where(seconds > 20, 3.017, 0)):
+        report = check_stamps(t_ns + np.rint(late * 1e9).astype(np.int64))
+        assert report.jitter_s == pytest.approx(2e-3, abs=0.15e-3)
+        assert report.rate_hz == pytest.approx(20, rel=3e-4)
+    jumped = t_ns + np.where(seconds > 35, 25_000_000, 0)
+    assert [f.code for f in doctor.check_times(jumped) if f.problem] == ["irregular"]
+
+
+def test_faults_of_a_recording_are_named_with_their_size() -> None:
+    run = simulate_session(SCENARIOS["cam-imu"], 0)
+    n = len(run.tracks[0].stamp_ns)
+
+    def report(*names: str) -> tuple[object, list[str]]:
+        found = check_stamps(apply_faults(run, names).tracks[0].stamp_ns)
+        return found, describe(found)
+
+    found, said = report("image-drops-30")
+    assert said == [f"{100 * found.missing_share:.2g} % of the frames are missing ({found.missing} of {found.expected}), the rate is 10 Hz"]
+    assert found.missing_share == pytest.approx(0.3, abs=0.1)
+    assert found.expected <= n
+    found, said = report("image-jitter-2")
+    assert found.jitter_s == pytest.approx(2e-3, rel=0.25)
+    assert said[0].startswith("stamps jitter by ")
+    assert said[0].endswith("ms rms around a regular grid, the rate is 10 Hz")
+    found, said = report("duplicate-stamps")
+    assert (found.duplicates, found.missing) == (n // 20, 0)
+    assert said == [f"{n // 20} frames have the stamp of another"]
+    assert report("zero-stamp")[1] == ["1 frame has a stamp of zero"]
+    assert report("zero-stamps")[1] == [f"{n} frames have a stamp of zero"]
+    assert report()[1] == []
+
+
+def test_the_doctor_says_the_share_that_is_missing_and_the_jitter() -> None:
+    t_ns, lost = _stamps(1400, 20, 2e-3, 0.3)
+    missing, jitter = doctor.check_times(t_ns)
+    assert (missing.code, missing.problem) == ("gap", True)
+    expected = len(t_ns) + lost
+    assert f"about {lost} samples missing ({100 * lost / expected:.0f} % of {expected}, the rate is 20 Hz)" in missing.text
+    assert (jitter.code, jitter.problem, jitter.text) == ("jitter", False, "stamps jitter by 2 ms rms around 50 ms")
+    (problem,) = doctor.check_times(_stamps(600, 20, 5e-3)[0])
+    assert (problem.code, problem.problem) == ("jitter", True)
+
+
+@pytest.mark.parametrize("batch", [2, 5, 100])
+def test_bursts_are_times_of_arrival(batch: int) -> None:
+    i = np.arange(3000)
+    t_ns = T0 + ((i // batch + 1) * batch * 5_000_000 + i % batch * 20_000).astype(np.int64)
+    report = check_stamps(t_ns)
+    assert report.bursts
+    assert (report.period_s, report.jitter_s) == (None, None)
+    assert describe(report) == ["stamps come in bursts: they are times of arrival, not of the sensor"]
+    assert "bursts" in {finding.code for finding in doctor.check_times(t_ns)}
+
+
+def test_times_on_no_grid_have_no_period_and_few_say_nothing() -> None:
+    for seed in range(10):
+        waits = np.random.default_rng(seed).exponential(0.05, 1000)
+        report = check_stamps(T0 + np.rint(np.cumsum(waits) * 1e9).astype(np.int64))
+        assert (report.period_s, report.missing, report.jitter_s) == (None, 0, None)
+    for t_ns in (np.zeros(0, np.int64), np.zeros(5, np.int64), np.full(50, T0), T0 + np.arange(9) * 50_000_000):
+        report = check_stamps(t_ns)
+        assert (report.count, report.period_s) == (len(t_ns), None)
+    assert check_stamps(np.arange(100) * 5_000_000).zeros == 0  # a recording's own time starts at 0
+
+
+def test_order_does_not_matter_and_is_told() -> None:
+    t_ns, _ = _stamps(1000, 20, 2e-3)
+    swapped = t_ns.copy()
+    swapped[[300, 301]] = swapped[[301, 300]]
+    report = check_stamps(swapped)
+    assert (report.backward, report.jitter_s) == (1, check_stamps(t_ns).jitter_s)
+    assert "1 stamp goes back in time" in describe(report)

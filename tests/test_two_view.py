@@ -35,15 +35,15 @@ def lens(run: Session) -> Camera:
     return true_rig(run, "test").cameras["cam0"]
 
 
-def poses(run: Session) -> tuple[Array, Array]:
-    """T_world_cam of each frame, and the camera's rate in its own axes."""
+def poses(run: Session, turns: Turns) -> tuple[Array, Array]:
+    """T_world_cam at the stamps of turns, and the camera's rate in its own axes."""
     sim = run.scenario.cameras[0]
-    state = run.trajectory.at((run.tracks[0].t_true_ns - START_NS) * 1e-9)
+    state = run.trajectory.at((turns.t_ns - START_NS) * 1e-9 + sim.dt_imu_cam)
     return state.T_world_imu @ sim.T_imu_cam, state.omega_i @ sim.T_imu_cam[:3, :3]
 
 
 def errors(run: Session, turns: Turns) -> Array:
-    R = poses(run)[0][:, :3, :3]
+    R = poses(run, turns)[0][:, :3, :3]
     out: Array = turns.angle - so3.log(np.swapaxes(R[turns.first], -1, -2) @ R[turns.last])
     return out
 
@@ -67,9 +67,9 @@ def whitened(run: Session, turns: Turns) -> Array:
 
 def time_offset(run: Session, turns: Turns, white: bool = False) -> tuple[float, float]:
     """The time offset that the turns' errors look like, beside a gyro bias, and its sigma."""
-    rate = poses(run)[1]
+    rate = poses(run, turns)[1]
     J = (rate[turns.last] - rate[turns.first]).ravel()[:, None]
-    A = np.concatenate([J, np.tile(np.eye(3) * 0.05, (len(turns.first), 1))], axis=1)
+    A = np.concatenate([J, (turns.duration[:, None, None] * np.eye(3)).reshape(-1, 3)], axis=1)
     W = np.eye(len(A)) if white else np.linalg.inv(covariance(turns))
     P = np.linalg.inv(A.T @ W @ A)
     return float((P @ A.T @ W @ errors(run, turns).ravel())[0]), float(P[0, 0] ** 0.5)
@@ -104,12 +104,12 @@ def honest(scene: Scene, seeds: int, **noise: float) -> tuple[Array, Array, floa
         (NEAR, {}, 0.95),
         (NEAR, {"noise_px": 0.1, "drift_px": 0.3}, 0.95),  # as a tracker errs that goes from frame to frame
         (NEAR, {"outliers": 0.15}, 0.9),
-        (Scene(2.0, 10.0), {}, 0.8),
+        (Scene(2.0, 10.0), {}, 0.2),  # in steps of up to four frames
     ],
     ids=["near", "drift", "wrong tracks", "farther"],
 )
 def test_errors_are_as_large_as_stated(scene: Scene, noise: dict[str, float], least: float) -> None:
-    white, _, given = honest(scene, 3, **noise)
+    white, _, given = honest(scene, 2, **noise)
     assert 0.8 < np.sqrt(np.mean(white**2)) < 1.25
     assert given > least
 
@@ -133,6 +133,18 @@ def test_noise_of_a_frame_is_shared_by_its_two_turns_and_a_trackers_steps_are_no
         shares.append(ends / (own + 2 * ends))
     assert shares[0] > 0.3  # 0.5 if all points were in both pairs, and the line across them the same
     assert shares[1] < 0.05
+
+
+def test_steps_are_longer_where_one_frame_has_no_parallax() -> None:
+    steps = []
+    for scene in (NEAR, Scene(6, 30), FAR):
+        run = session(0)
+        turns = turns_of_tracks(simulate_tracks(run, scene=scene), lens(run))
+        steps.append(float(np.median(turns.duration)) * 20)
+        assert np.sqrt(np.mean(whitened(run, turns) ** 2)) < 1.25
+        assert time_offset(run, turns)[1] < 0.15e-3
+    assert steps[0] == pytest.approx(1)
+    assert steps[1] >= 2
 
 
 def test_turning_on_the_spot_and_distant_scenes_need_no_translation() -> None:

@@ -98,6 +98,11 @@ def test_wrong_sizes_stamps_and_images_are_named() -> None:
     assert "again" not in tracks.labels
     assert tracks.warnings == ("1 of 8 images are left out: their stamps repeat or go back",)
 
+    frozen = [*images[:3], replace(images[2], t_ns=3), *images[4:]]
+    tracks = track_features(iter(frozen), "cam0", silent)
+    assert tracks.t_ns.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert tracks.warnings == ("1 of 8 images are left out: pixel by pixel they are the one before",)
+
     def damaged() -> Gray:
         raise BadInputError("not a readable image")
 

@@ -232,6 +232,22 @@ def test_pairs_without_enough_points_are_left_out() -> None:
     assert len(turns.first) > 70
 
 
+def test_points_that_tell_nothing_give_no_turn() -> None:
+    run = session(0, 2.0)
+    tracks = simulate_tracks(run)
+    noise = np.random.default_rng(0).uniform(0, 480, tracks.uv.shape)
+    for uv in (np.full_like(tracks.uv, 200.0), noise, tracks.uv + 1e6):
+        with pytest.raises(BadInputError, match="no two frames share enough features"):
+            turns_of_tracks(replace(tracks, uv=uv), lens(run))
+
+
+def test_a_camera_at_rest_turns_by_no_more_than_its_noise() -> None:
+    run = session(0, 4.0, motion="static")
+    turns = turns_of_tracks(simulate_tracks(run), lens(run))
+    assert np.sqrt(np.mean(whitened(run, turns) ** 2)) < 1.25
+    assert np.abs(turns.angle).max() < 1e-3
+
+
 def test_bad_input_is_one_line() -> None:
     run = session(0, 2.0)
     tracks = simulate_tracks(run)

@@ -31,13 +31,14 @@ _AHEAD = 2  # images decoded before they are needed
 def track_features(
     images: Iterable[ImageFrame], camera: str, progress: Progress, total: int | None = None, n_features: int = _FEATURES
 ) -> FeatureTracks:
-    """Return about n_features tracks in each image; images that cannot be decoded, or that are not later than the one before, are left out.
+    """Return about n_features tracks in each image; images that cannot be decoded, that are not later than the one before,
+    or that repeat it, are left out.
 
     An image of another size is bad input, and so are images of which none can be read.
     """
     tracker = _Tracker(n_features)
     broken: list[str] = []
-    late, n_images, size, first = 0, 0, (0, 0), ""
+    late, repeated, n_images, size, first = 0, 0, 0, (0, 0), ""
     t_ns: list[int] = []
     labels: list[str] = []
     rows: list[tuple[NDArray[np.int32], NDArray[np.int32], Points]] = []
@@ -58,6 +59,9 @@ def track_features(
                     f"{camera}: image {one_line(frame.label, 80)} is {here[0]}x{here[1]}, {one_line(first, 80)} is {size[0]}x{size[1]}: "
                     "one camera has one image size, give each its own --camera or folder"
                 )
+            if tracker.same(image):
+                repeated += 1
+                continue
             number, uv = tracker.follow(image)
             rows.append((np.full(len(number), len(t_ns), np.int32), number, uv))
             t_ns.append(frame.t_ns)
@@ -75,6 +79,8 @@ def track_features(
         warnings.append(f"{len(broken)} of {n_images} images could not be read, the first: {one_line(broken[0], 160)}")
     if late:
         warnings.append(f"{late} of {n_images} images are left out: their stamps repeat or go back")
+    if repeated:
+        warnings.append(f"{repeated} of {n_images} images are left out: pixel by pixel they are the one before")
     return FeatureTracks(
         camera, size, np.array(t_ns, np.int64), tuple(labels), frame_of, track, points.astype(np.float64), warnings=tuple(warnings)
     )
@@ -119,15 +125,20 @@ class _Tracker:
     def __init__(self, n_features: int) -> None:
         self._quota = max(1, round(n_features / (_CELLS[0] * _CELLS[1])))
         self._gain: float | None = None  # from 16 bit to 8
+        self._image: Gray | NDArray[np.uint16] = np.zeros((0, 0), np.uint8)  # as it came
         self._last = np.zeros((0, 0), np.uint8)
         self._uv: Points = np.zeros((0, 2), np.float32)
         self._number: NDArray[np.int32] = np.zeros(0, np.int32)
         self._shift: Points = np.zeros((0, 2), np.float32)  # how far each moved last time: where to look for it next
         self._born = 0
 
+    def same(self, image: Gray | NDArray[np.uint16]) -> bool:
+        """Return whether this is the last image again, as a driver that repeats itself gives it: a turn of exactly nothing."""
+        return np.array_equal(self._image, image)
+
     def follow(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> tuple[NDArray[np.int32], Points]:
         """Return the numbers (n,), ascending, and pixels (n, 2) of the features in the next image."""
-        gray = self._eight_bit(image)
+        gray, self._image = self._eight_bit(image), image
         if len(self._uv):
             self._move(gray)
         self._add(gray)

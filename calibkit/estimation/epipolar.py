@@ -116,6 +116,13 @@ def _solve(H: Array, b: Array) -> Array:
     return out
 
 
+def _inverse(H: Array) -> Array:
+    """Return H^-1 (p, k, k), no eigenvalue of H taken as less than a millionth of the largest."""
+    values, vectors = np.linalg.eigh(H)
+    out: Array = (vectors / np.maximum(values, 1e-6 * values[:, -1:] + _TINY)[:, None]) @ np.swapaxes(vectors, -1, -2)
+    return out
+
+
 def rotation_only(m: Matches, steps: int = 6) -> tuple[Array, Array, Array]:
     """Return R (p, 3, 3) that least squares gives when nothing translates, its covariance (p, 3, 3) and the points' weights (p, n).
 
@@ -135,7 +142,7 @@ def rotation_only(m: Matches, steps: int = 6) -> tuple[Array, Array, Array]:
     score = scores[0] + scores[1]
     # The mean derivative of a score w(|e|) e in two dimensions is w^2 for Cauchy's w.
     slope = sum((row * (w * w)[:, None]) @ np.swapaxes(row, -1, -2) for row in rows)
-    inverse = np.linalg.inv(slope + _TINY * np.eye(3))
+    inverse = _inverse(slope)
     return R, inverse @ (score @ np.swapaxes(score, -1, -2)) @ inverse, w
 
 
@@ -270,12 +277,19 @@ def trust(m: Matches, R: Array, t: Array, keep: Array) -> Trust:
     turned = J[:, 3:] * (np.sqrt(variance)[:, None] * keep / np.where(np.abs(r.along) > _TINY, r.along, 1))[:, None]
     A = B.copy()
     A[:, 3:, 3:] -= turned @ np.swapaxes(turned, -1, -2)
-    values, vectors = np.linalg.eigh(A)
-    inverse = (vectors / np.maximum(values, 1e-6 * values[:, -1:] + _TINY)[:, None]) @ np.swapaxes(vectors, -1, -2)
+    inverse = _inverse(A)
     cov = (inverse @ B @ inverse)[:, :3, :3] * variance[:, None, None]
     influence = inverse[:, :3] @ (J * keep[:, None])
     seen = np.sum(keep * r.along**2, axis=-1) / n
     return Trust(cov, influence, np.sqrt(variance), np.sqrt(np.maximum(seen - variance, 0)), r.across, r.normal)
+
+
+def spread(m: Matches) -> Array:
+    """Return the variance (p,) rad^2 of the rays about their main direction: without any, nothing tells a turn about it."""
+    weighted = m.first * m.given[:, None]
+    values = np.linalg.eigvalsh(weighted @ np.swapaxes(m.first, -1, -2))
+    out: Array = 1 - values[:, -1] / np.maximum(m.given.sum(axis=-1), 1)
+    return out
 
 
 def parallax_cov(m: Matches, parallax: Array) -> Array:

@@ -28,7 +28,9 @@ _STEPS = 4
 _FEWEST = 25  # points: five unknowns, wrong tracks, and a scatter to be estimated
 _FEWEST_SHARE = 0.4  # of the points of a pair; where fewer agree, something else moves
 _LEAST_PARALLAX = 2.5  # sigmas; below, the direction of the translation is noise, and the rotation with it
+_LEAST_SPREAD = 2e-4  # rad^2: half a degree, each way
 _LARGEST_SIGMA = 0.02  # rad, of a turn that tells anything
+_ROUNDING = 1e-12  # rad
 _OFTEN = 0.05  # of the pairs without parallax: a longer step is tried
 _LONGEST_STEP, _LONGEST_S = 4, 0.25  # frames, s: tracks end, and fast motion is averaged away
 
@@ -127,7 +129,7 @@ def _chain(tracks: FeatureTracks, lens: _Lens, solve: Callable[[Matches], _Solve
         solved = solve(batch.matches)
         keep = slice(low, min(low + _CHUNK, n_pairs))
         kept = slice(0, keep.stop - keep.start)
-        angle[keep], cov[keep] = so3.log(solved.R[kept]), solved.cov[kept]
+        angle[keep], cov[keep] = so3.log(solved.R[kept]), solved.cov[kept] + _ROUNDING**2 * np.eye(3)
         good[keep], still[keep] = solved.good[kept], solved.still[kept]
         ends, moments = _shared(batch, solved)
         shared[low + 1 : low + 1 + len(ends)] = ends
@@ -196,13 +198,22 @@ def _two_view(m: Matches) -> _Solved:
     cov[still] = cov_0[still] + epipolar.parallax_cov(m, fit.parallax)[still]
     influence[still] = 0
     largest = np.linalg.eigvalsh(cov)[:, -1]
-    return _Solved(R, cov, good & (certain | still) & (largest < _LARGEST_SIGMA**2), still, influence, fit.across, fit.normal, fit.sigma)
+    return _Solved(
+        R,
+        cov,
+        good & (certain | still) & (epipolar.spread(m) > _LEAST_SPREAD) & (largest < _LARGEST_SIGMA**2),
+        still,
+        influence,
+        fit.across,
+        fit.normal,
+        fit.sigma,
+    )
 
 
 def _plain(m: Matches) -> _Solved:
     """Return the turns of pairs as if nothing translated."""
     R, cov, _ = epipolar.rotation_only(m)
-    enough = m.given.sum(axis=-1) >= _FEWEST
+    enough = (m.given.sum(axis=-1) >= _FEWEST) & (epipolar.spread(m) > _LEAST_SPREAD)
     none = np.zeros_like(m.given)
     return _Solved(R, cov, enough, ~enough, np.zeros_like(m.first), none, np.zeros_like(m.J[:, :, 0]), np.ones(len(R)))
 

@@ -30,9 +30,12 @@ _ROUNDS = 6
 _OUTLIER = 8.0  # chi-squared a degree of freedom: beyond chance in 100 000 turns of three axes
 _MEDIAN = {1: 0.455, 2: 1.386, 3: 2.366}  # of chi-squared
 _STEPS = 15
+_CLOSE = 1e-6  # chi-squared that a step still gains
+_PRIOR = np.array([TILT**-2, TILT**-2, TILT**-2, 0.0])
 _LONGEST_STEP_S = 0.05
 _WINDOW_STEP_S = 0.002
 _WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
+_DRAWS = 8
 _SLAB = 2_000_000  # numbers held at once
 
 
@@ -58,22 +61,14 @@ class Alignment:
     shape: Array  # (3,) variances of the axes relative to each other, where the turns do not say it
     R: Array  # (d, 3)
     free_rotation: bool
-    t_ref: float
-    clock: Clock | None
-    c: Array  # (p,) tau at t_ref, then skew and jumps as the clock has them
+    tau: float  # s, the offset where the clock is constant, else at its reference time
+    clock: Clock | None = None
     converged: bool = False
 
-    def basis(self, t: Array) -> Array:
-        """Return (m, p): 1, (t - t_ref) where the clock drifts, and a step for each of its jumps."""
-        columns: list[Array] = [np.ones_like(t)]
-        if self.clock is not None:
-            columns += [t - self.t_ref] * bool(self.clock.skew)
-            columns += [(t >= jump.t_s) * 1.0 - float(self.t_ref >= jump.t_s) for jump in self.clock.jumps]
-        return np.stack(columns, axis=1)
-
     def shift(self, t: Array) -> Array:
-        """Return the offset (m,) at the turns' times t (m,)."""
-        return np.asarray(self.basis(t) @ self.c, np.float64)
+        """Return the offset (m,) at the turns' times t (m,): tau, and how the clock departs from it."""
+        drift = 0.0 if self.clock is None else self.clock.at(t) - self.clock.offset_s
+        return np.asarray(np.full_like(t, self.tau) + drift, np.float64)
 
     @property
     def turns(self) -> int:
@@ -138,36 +133,36 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
 
 def newton(a: Alignment) -> Alignment:
     """Return the alignment at the bottom near it, by Gauss-Newton."""
-    R, c = a.R, a.c
-    free = slice(0, None) if a.free_rotation else slice(3, None)
-    prior = np.zeros(3 + len(c))
-    prior[:3] = 1 / TILT**2
+    free = np.arange(0 if a.free_rotation else 3, 4)
     for _ in range(_STEPS):
-        at = replace(a, R=R, c=c)
-        H = sum((X.T @ X for X in columns(at)), np.zeros((4 + len(c), 4 + len(c))))
-        A = (H[:-1, :-1] + np.diag(prior))[free, free]
+        H = _gram(columns(a))
+        A = (H[:4, :4] + np.diag(_PRIOR))[np.ix_(free, free)]
         scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
-        step = np.zeros(3 + len(c))
-        step[free] = scale * np.linalg.lstsq(A * scale[:, None] * scale, H[:-1, -1][free] * scale, rcond=1e-13)[0]
+        step = np.zeros(4)
+        step[free] = scale * np.linalg.lstsq(A * scale[:, None] * scale, H[free, 4] * scale, rcond=1e-13)[0]
         far = abs(step[3]) / _LONGEST_STEP_S
         step /= max(1.0, far)
-        R, c = moved(R, step[:3]), c + step[3:]
-        if step @ (H[:-1, :-1] @ step) < 1e-6 * max(1.0, 0.0) and far < 1:
-            return replace(a, R=R, c=c, converged=True)
-    return replace(a, R=R, c=c, converged=False)
+        a = replace(a, R=moved(a.R, step[:3]), tau=a.tau + float(step[3]))
+        if step @ (H[:4, :4] @ step) < _CLOSE and far < 1:
+            return replace(a, converged=True)
+    return replace(a, converged=False)
 
 
 def columns(a: Alignment) -> list[Array]:
-    """Return the whitened columns (rows, 3 + p + 1) of every part: rotation, clock, residuals."""
-    return [linearised(part, a.track, a.R, a.shift(part.stretch.t), a.basis(part.stretch.t)) for part in a.parts]
+    """Return the whitened columns (rows, 5) of every part: rotation (3), tau, residuals."""
+    return [linearised(part, a.track, a.R, a.shift(part.stretch.t)) for part in a.parts]
+
+
+def _gram(parts: Sequence[Array]) -> Array:
+    return np.asarray(sum((X.T @ X for X in parts), np.zeros((5, 5))), np.float64)
 
 
 def sweep(a: Alignment, tau: Array) -> Array:
-    """Return the V (k,): chi-squared with tau in place of the offset at t_ref, its drift kept, the best rotation and biases at each."""
+    """Return the V (k,): chi-squared with tau in place of the alignment's, the clock's drift kept, the best rotation and biases at each."""
     cost, gram = np.zeros(len(tau)), np.zeros((len(tau), 4, 4))
     for part in a.parts:
         stretch = part.stretch
-        drift = a.shift(stretch.t) - a.c[0]
+        drift = a.shift(stretch.t) - a.tau
         many = max(1, _SLAB // (16 * len(stretch.t)))
         for i in range(0, len(tau), many):
             shift = drift[:, None] + tau[i : i + many]
@@ -195,9 +190,8 @@ def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, fl
     if not 0 < k < len(grid) - 1 or min(cost[:k].max(), cost[k + 1 :].max()) - cost[k] < _WINDOW_DEPTH:
         return None
     extra, information = float(grid[k]), 0.0
-    ones = np.ones((len(stretch.t), 1))
     for _ in range(3):
-        X = linearised(part, a.track, a.R, base + extra, ones)[:, 3:]
+        X = linearised(part, a.track, a.R, base + extra)[:, 3:]
         information = float(X[:, 0] @ X[:, 0])
         extra += float(np.clip(X[:, 0] @ X[:, 1] / max(information, 1e-300), -_WINDOW_STEP_S, _WINDOW_STEP_S))
     middle = float(stretch.middle.mean())
@@ -205,21 +199,45 @@ def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, fl
     return float(stretch.t[0]), float(stretch.t[-1]), at + extra, information**-0.5
 
 
-def epochs(a: Alignment, parts: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """Return each turn's information (n, 1, 1) and score (n, 1) of tau with all else eliminated, and its time (n,) s.
+def turned_alike(a: Alignment) -> float:
+    """Return by how much chi-squared is lower with the track's turns than without: below nothing where the track has noise alone."""
+    without = sum(float(np.sum(part.clean(part.stretch.turns.angle[:, part.stretch.axes]) ** 2)) for part in a.parts)
+    return without - sum(float(np.sum(X[:, -1] ** 2)) for X in columns(a))
+
+
+def noise_information(a: Alignment) -> float:
+    """Return the information on tau that noise of the track's rates would pretend, in mean, if they did not change at all.
+
+    Measured with rates of that noise (third differences: var / 20), drawn at the stamps.
+    """
+    every = max(1, round(2 * a.track.reach / a.track.step))
+    rate = a.track.rate[::every]
+    steady = a.track.chain[::every] >= 0
+    third = np.diff(rate, 3, axis=0)[steady[3:] & steady[2:-1] & steady[1:-2] & steady[:-3]]
+    if not len(third):
+        return 0.0
+    sigma = 1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20)
+    rng = np.random.default_rng(0)
+    total = 0.0
+    for part in a.parts:
+        drawn = sigma * rng.standard_normal((_DRAWS, len(part.stretch.t), 3)) @ a.R.T
+        change = drawn[:, part.stretch.turns.last] - drawn[:, part.stretch.turns.first]
+        total += float(np.sum(part.clean(np.moveaxis(change, 0, 2)) ** 2)) / _DRAWS
+    return total
+
+
+def epochs(a: Alignment, parts: Sequence[Array], by_axis: bool = False) -> tuple[Array, Array, Array]:
+    """Return each turn's information (n, 1, 1) and score (n, 1) of tau with all else eliminated, and its time (n,) s; or each axis' (n, d).
 
     With h = H^-1 e: X h / h_tau is tau's column without what the others explain.
     """
-    H = sum((X[:, :-1].T @ X[:, :-1] for X in parts), np.zeros((3 + len(a.c), 3 + len(a.c))))
-    H[:3, :3] += np.eye(3) / TILT**2
-    free = np.arange(0 if a.free_rotation else 3, len(H))
-    h = np.zeros(len(H))
-    h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, len(free) - len(a.c)]
-    S, g, t = [], [], []
-    for X, part in zip(parts, a.parts, strict=True):
-        u = X[:, :-1] @ h / h[3]
-        d = len(a.R)
-        S.append(np.sum((u**2).reshape(-1, d), axis=1))
-        g.append(np.sum((u * X[:, -1]).reshape(-1, d), axis=1))
-        t.append(part.stretch.middle)
-    return np.concatenate(S)[:, None, None], np.concatenate(g)[:, None], np.concatenate(t)
+    H = _gram(parts)[:4, :4] + np.diag(_PRIOR)
+    free = np.arange(0 if a.free_rotation else 3, 4)
+    h = np.zeros(4)
+    h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, -1]
+    u = np.concatenate([X[:, :4] @ h / h[3] for X in parts]).reshape(-1, len(a.R))
+    score = u * np.concatenate([X[:, 4] for X in parts]).reshape(-1, len(a.R))
+    t = np.concatenate([part.stretch.middle for part in a.parts])
+    if by_axis:
+        return u**2, score, t
+    return np.sum(u**2, axis=1)[:, None, None], np.sum(score, axis=1)[:, None], t

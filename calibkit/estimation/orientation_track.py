@@ -33,6 +33,7 @@ class OrientationTrack:
     rate: Array  # (g, 3) rad/s
     chain: NDArray[np.int64]  # (g,) orientations of different chains cannot be compared; -1 where there is none
     delta: Array  # (g - 1, 3) rotation vector from each grid point to the next
+    reach: float  # s to either side that each point is smoothed over
 
     @property
     def duration(self) -> float:
@@ -102,7 +103,7 @@ def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64]) -> Ori
     parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval) for i in range(0, len(grid), _CHUNK)]
     fitted, rate, chain = (np.concatenate(each) for each in zip(*parts, strict=True))
     delta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[:-1]), fitted[1:]))
-    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta)
+    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, reach)
 
 
 def _regress(

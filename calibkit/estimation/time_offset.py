@@ -9,8 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibkit.data.observations import ImuSamples, PoseSamples
+from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError
-from calibkit.estimation.alignment import Alignment, Windows, columns, epochs, newton, settle, sweep, window_offsets
+from calibkit.estimation.alignment import (
+    Alignment,
+    Windows,
+    columns,
+    epochs,
+    newton,
+    noise_information,
+    settle,
+    sweep,
+    turned_alike,
+    window_offsets,
+)
 from calibkit.estimation.clock import Clock, fit_clock
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
 from calibkit.estimation.time_offset_start import Start, find_starts
@@ -47,7 +59,7 @@ class Settings:
 class TimeOffsetFit:
     """The offset and everything that it is judged by; times in s are on the track's axis, from its origin.
 
-    td = coarse_ns 1e-9 + tau, at the time alignment.t_ref where the clock is not constant.
+    td = coarse_ns 1e-9 + tau, at the clock's reference time where it is not constant.
     """
 
     alignment: Alignment
@@ -62,14 +74,17 @@ class TimeOffsetFit:
     clock: Clock | None
     gyro_bias: Array  # (3,) rad/s in the track's axes: the mean of what the stretches found
     n_turns: int  # in the overlap
+    gain: float  # chi-squared that the reference's turns explain, correlation paid for
+    noise_share: float  # of the information on tau, that noise pretends
 
     @property
     def td(self) -> float:
-        return self.coarse_ns * 1e-9 + float(self.alignment.c[0])
+        return self.coarse_ns * 1e-9 + self.alignment.tau
 
     @property
     def sigma(self) -> float:
-        return float(np.sqrt(self.covariance.corrected[0, 0]))
+        """Return one standard deviation, correlated residuals and noise in the reference's rates paid for."""
+        return float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, 1e-6)))
 
     @property
     def depth(self) -> float:
@@ -84,7 +99,7 @@ def _inflation(covariance: Covariance) -> float:
     return covariance.variance_factor * max(1.0, float(covariance.factors[0])) ** 2
 
 
-def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings) -> TimeOffsetFit:
+def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress = silent) -> TimeOffsetFit:
     """Return the offset that lays the turns best against the reference.
 
     BadInputError where the two share too little time. What the fit is worth is for `time_offset_verdict` to say.
@@ -104,14 +119,15 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         cost = sweep(a, tau)
         k = int(np.argmin(cost))
         inside = 2 <= k < len(tau) - 2
-        if inside and abs(tau[k] - a.c[0]) <= 2 * settings.step_s:
+        if inside and abs(tau[k] - a.tau) <= 2 * settings.step_s:
             break
         if reach >= _MAX_REACH_S:
             break
         reach = min(2 * reach, _MAX_REACH_S)
-        a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, c=np.array([tau[k]]))
+        a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]))
         a, windows = _with_clock(settle(a, settings.levels), settings, reach)
     covariance, interval = _trust(a)
+    pretended = noise_information(a) * float(covariance.plain[0, 0]) / covariance.variance_factor
     fit = TimeOffsetFit(
         alignment=a,
         start=start,
@@ -125,8 +141,21 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         clock=a.clock,
         gyro_bias=_bias(a),
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
+        gain=turned_alike(a) / _inflation(covariance),
+        noise_share=min(pretended, 1.0),
     )
     return replace(fit, second=_second(fit, starts[1:]))
+
+
+def bootstrap_sigma(fit: TimeOffsetFit, draws: int, seed: int = 0) -> float:
+    """Return the standard deviation of the offset over draws of the stretches with replacement, one Gauss-Newton step each."""
+    grams = np.stack([X.T @ X for X in columns(fit.alignment)])
+    free = np.arange(0 if fit.alignment.free_rotation else 3, 4)
+    drawn = np.random.default_rng(seed).multinomial(len(grams), np.full(len(grams), 1 / len(grams)), draws)
+    total = np.einsum("db,bij->dij", drawn, grams)
+    A = total[:, free[:, None], free] + 1e-9 * np.trace(total[0]) / 5 * np.eye(len(free))
+    steps = np.linalg.solve(A, total[:, free, 4:])[:, -1, 0]
+    return float(np.std(steps))
 
 
 def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settings, reach: float) -> Alignment:
@@ -144,9 +173,7 @@ def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settin
         shape=np.ones(3),
         R=start.R,
         free_rotation=settings.rotation is None,
-        t_ref=float((stretches[0].t[0] + stretches[-1].t[-1]) / 2),
-        clock=None,
-        c=np.zeros(1),
+        tau=0.0,
     )
 
 
@@ -160,9 +187,7 @@ def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignme
         constant = clock.kind == "constant"
         if constant and (a.clock is None or a.clock.kind == "constant"):
             return replace(a, clock=clock), windows
-        drift = [clock.skew] * bool(clock.skew) + [jump.size_s for jump in clock.jumps]
-        a = replace(a, clock=clock, t_ref=clock.t_ref_s, c=np.array([clock.offset_s, *drift]))
-        a = settle(a, settings.levels)
+        a = settle(replace(a, clock=clock, tau=clock.offset_s), settings.levels)
         windows = window_offsets(a, reach)
     return a, windows
 
@@ -178,10 +203,10 @@ def _trust(a: Alignment) -> tuple[Covariance, tuple[float, float]]:
     parts = columns(a)
     S, g, t = epochs(a, parts)
     rows = sum(len(X) for X in parts)
-    unknowns = len(a.c) + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)
+    unknowns = 1 + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)
     factor = sum(float(X[:, -1] @ X[:, -1]) for X in parts) / max(1, rows - unknowns)
     covariance = covariance_in_time(S, g, t, factor, np.array([SCALES["s"]]))
-    rise, middle = _CHI2_95 * _inflation(covariance), float(a.c[0])
+    rise, middle = _CHI2_95 * _inflation(covariance), a.tau
     width = 4 * float(np.sqrt(covariance.plain[0, 0] * _inflation(covariance) / factor))
     tau = middle + np.linspace(-width, width, _PROFILE)
     above = sweep(a, tau)
@@ -224,8 +249,7 @@ def _rival(a: Alignment, other: Start, further_ns: int) -> tuple[float, float] |
     if sum(known) < max(2, _RIVAL_SHARE * len(known)):
         return None
     parts = tuple(part for part, there in zip(a.parts, known, strict=True) if there)
-    moved_by = further_ns * 1e-9
     shifted = tuple(replace(part, stretch=replace(part.stretch, origin_ns=a.track.origin_ns - further_ns)) for part in parts)
-    there = newton(replace(a, parts=shifted, R=other.R, t_ref=a.t_ref + moved_by, c=np.array([0.0, *a.c[1:]])))
+    there = newton(replace(a, parts=shifted, R=other.R, tau=0.0, clock=None))
     costs = [sum(float(np.sum(X[:, -1] ** 2)) for X in columns(each)) for each in (replace(a, parts=parts), there)]
-    return costs[1] - costs[0], float(there.c[0])
+    return costs[1] - costs[0], there.tau

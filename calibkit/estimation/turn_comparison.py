@@ -139,21 +139,22 @@ def _columns(stretch: Stretch, turned: Array, R: Array) -> Array:
     predicted = turned @ R.T
     slope = -so3.hat(predicted) if len(R) == 3 else turned[:, :, None]
     left = stretch.turns.angle[:, None, stretch.axes] - predicted
-    return np.concatenate([slope, left[..., None]], axis=3).swapaxes(1, 2)
+    together: Array = np.concatenate([slope, left[..., None]], axis=3).swapaxes(1, 2)
+    return together
 
 
-def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array, basis: Array) -> Array:
-    """Return whitened columns (rows, 3 + p + 1) at one shift (m,): what rotation and the clock's p numbers move, and the residuals.
+def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
+    """Return whitened columns (rows, 5) at one shift (m,): what rotation (3) and offset move predictions by, and the residuals.
 
-    d beta = J_r(beta)^-1 omega_last dt_last - J_l(beta)^-1 omega_first dt_first, with dt = basis dc.
+    d beta / d shift = J_r(beta)^-1 omega_last - J_l(beta)^-1 omega_first.
     """
     stretch = part.stretch
-    turned, before, after = (x[:, 0] for x in stretch.beta(track, shift[:, None]))
+    turned, before, after = stretch.beta(track, shift[:, None])
     inverse = np.linalg.inv(so3.right_jacobian(turned))
-    start, end = (np.swapaxes(inverse, 1, 2) @ before[..., None]), (inverse @ after[..., None])
-    slope = end * basis[stretch.turns.last][:, None, :] - start * basis[stretch.turns.first][:, None, :]
-    columns = _columns(stretch, turned[:, None], R)[:, :, 0]
-    return part.clean(np.concatenate([columns[..., :3], R @ slope, columns[..., 3:]], axis=2))
+    slope: Array = (inverse @ after[..., None] - np.swapaxes(inverse, 2, 3) @ before[..., None])[..., 0] @ R.T
+    columns = _columns(stretch, turned, R)[:, :, 0]
+    together: Array = np.concatenate([columns[..., :3], slope.swapaxes(1, 2), columns[..., 3:]], axis=2)
+    return part.clean(together)
 
 
 def moved(R: Array, d: Array) -> Array:

@@ -121,7 +121,7 @@ def estimate_levels(noises: Sequence[TurnNoise], residuals: Sequence[Array], jit
     noises, residuals = noises[::step], residuals[::step]
     n = sum(len(r) for r in residuals)
     mean = [float(np.mean(np.concatenate([getattr(noise, kind)[0] for noise in noises]))) for kind in ("end", "own", "jitter")]
-    unit = [1 / max(each, 1e-300) for each in mean]
+    unit = [1 / each if each > 0 else 0.0 for each in mean]
 
     def likelihood(ratios: tuple[float, float]) -> tuple[float, NoiseLevels]:
         levels = NoiseLevels(unit[0], 10 ** ratios[0] * unit[1], 10 ** ratios[1] * unit[2])

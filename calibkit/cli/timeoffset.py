@@ -1,0 +1,104 @@
+"""`calibkit timeoffset`: how far two sensors' clocks are apart."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibkit.cli import options
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("timeoffset")(run)
+
+
+def run(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="SOURCE...", help="Bags, folders or CSV files with both sensors, turning, for 30 s or more.")
+    ],
+    of: Annotated[
+        str | None,
+        typer.Option("--of", metavar="SENSOR", help="Sensor (name or topic) whose stamps are to be corrected. [default: the camera]"),
+    ] = None,
+    to: Annotated[str | None, typer.Option("--to", metavar="SENSOR", help="Sensor whose clock counts. [default: the IMU]")] = None,
+    camera: Annotated[list[str] | None, typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable.")] = None,
+    imu: Annotated[list[str] | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic; repeatable.")] = None,
+    pose: Annotated[
+        list[str] | None,
+        typer.Option("--pose", metavar="TOPIC", help="Poses, odometry or rates: topic, pose0=/topic or tf:PARENT/CHILD; repeatable."),
+    ] = None,
+    target: Annotated[
+        Path | None, typer.Option("--target", metavar="T.yaml", help="The board that the camera sees. [default: features of the scene]")
+    ] = None,
+    out: options.Out = None,
+    rig: options.Rigs = None,
+    report: options.Report = None,
+    json_file: options.Json = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Without a board: rotation alone explains the features (f * gyro). Biased beside near things.")
+    ] = False,
+    inverse_poses: Annotated[
+        bool, typer.Option("--inverse-poses", help="Poses are those of the world seen from the sensor (T_sensor_world).")
+    ] = False,
+    fix_rotation: Annotated[
+        bool, typer.Option("--fix-rotation", help="Take the rotation between the sensors from the rig file. [default: found anew]")
+    ] = False,
+    reach: Annotated[float, typer.Option("--reach", metavar="MS", help="Of the V to either side; it widens itself where it must.")] = 50.0,
+    step: Annotated[float, typer.Option("--step", metavar="MS", help="Of the V.")] = 0.5,
+    bootstrap: Annotated[int, typer.Option("--bootstrap", metavar="N", help="Also draw the stretches of the recording N times.")] = 0,
+    gyro_bandwidth: Annotated[
+        float | None, typer.Option("--gyro-bandwidth", metavar="HZ", help="Of the gyroscope's low-pass: tells what of td is its delay.")
+    ] = None,
+    exposure: Annotated[
+        float | None, typer.Option("--exposure", metavar="MS", help="Of the camera, if its stamps are the exposure's start.")
+    ] = None,
+    readout: Annotated[
+        float | None, typer.Option("--readout", metavar="MS", help="From the first row to the last, if stamps are the first row's.")
+    ] = None,
+    rate: options.Rate = None,
+    gyro_unit: options.GyroUnit = None,
+    accel_unit: options.AccelUnit = None,
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Look for corners again, even where they were found before.")] = False,
+    ros_distro: options.RosDistro = None,
+    force: options.Force = False,
+    strict: options.Strict = False,
+) -> None:
+    """Time offset of two sensors that turn together: t_to = t_of + td, with its interval, over time, at any lag.
+
+    Camera and IMU (with --target by a board, else by the scene), odometry and IMU, two pose streams, two IMUs, wheel odometry and IMU.
+    The motion must turn, and change its rate of turn. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the recording does not tell td.
+    """
+    from calibkit.cli.progress import bar
+    from calibkit.cli.shown import show
+    from calibkit.errors import BadInputError
+    from calibkit.estimation.time_offset_delay import Delays
+    from calibkit.io.imu_options import ImuOptions
+    from calibkit.stages.time_offset import Options, time_offset
+
+    for name, value, low, high in (("--reach", reach, 5, 800), ("--step", step, 0.05, 5)):
+        if not low <= value <= high:
+            raise BadInputError(f"{name} {value:g}: give {low} to {high} ms")
+    for name, given in (("--gyro-bandwidth", gyro_bandwidth), ("--exposure", exposure), ("--readout", readout)):
+        if given is not None and not 0 < given < 1e5:
+            raise BadInputError(f"{name} {given:g}: give a number above 0")
+    if not 0 <= bootstrap <= 100000:
+        raise BadInputError(f"--bootstrap {bootstrap}: give 0 to 100000")
+    asked = Options(
+        of=of,
+        to=to,
+        sensors=(*(camera or ()), *(imu or ()), *(pose or ())),
+        target=target,
+        reading=ImuOptions(rate, gyro_unit, accel_unit),
+        plain=plain,
+        inverse_poses=inverse_poses,
+        fix_rotation=fix_rotation,
+        reach_s=reach * 1e-3,
+        step_s=step * 1e-3,
+        bootstrap=bootstrap,
+        delays=Delays(gyro_bandwidth, None if exposure is None else exposure * 1e-3, None if readout is None else readout * 1e-3),
+        cache=not no_cache,
+        ros_distro=ros_distro,
+    )
+    outputs = options.outputs_of([*sources, *([target] if target else [])], out, report, json_file, rig, force)
+    show(time_offset(sources, outputs, asked, bar), strict)

@@ -1,0 +1,165 @@
+"""What a time offset is worth: whether the recording tells it at all, what spoils it, and the motion that would mend it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.data.plural import counted
+from calibkit.data.verdict import Reason, Status, Verdict
+from calibkit.estimation.alignment import columns, epochs
+from calibkit.estimation.clock import describe
+from calibkit.estimation.stamps import StampReport
+from calibkit.estimation.time_offset import TimeOffsetFit
+from calibkit.geometry.so3 import Array
+from calibkit.solver.trust import SCALES, grade
+
+_ALIKE = 60.0  # chi-squared that turns in common must explain; noise alone, searched over every lag and rotation, reaches 40
+_PRETENDED = 0.2  # of the information may be noise in the rates
+_BOWL = 25.0  # chi-squared of the V's bottom below its sides
+_STILL = 0.02  # rad/s; slower is standing still
+_UNLIKE = 0.5  # of the turns may be left unexplained
+_LOST = 0.1  # of the turns may be outliers
+_MISSING = 0.05  # of the frames
+_JITTER_S = 5e-4
+_WORSE = 3.0  # sigma over that of independent residuals
+_APART = 16.0  # chi-squared of the axes' own offsets about their mean
+_GOOD_CHANGE = 4.0  # rad/s^2 rms: 1 rad/s back and forth about every axis at 0.6 Hz
+_MOTION = "turn the rig back and forth about two or more axes, 30 to 60 deg each way, once or twice a second, for 30 s"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What is known of the offset."""
+
+    status: Status
+    reasons: tuple[Reason, ...]
+
+
+def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: dict[str, StampReport]) -> Judged:
+    """Return status and reasons of `name` = dt_to_of."""
+    why = _not_observable(of, to, fit)
+    spoilt = [Reason(Verdict.CHECK, text) for sensor, report in stamps.items() for text in about_stamps(sensor, report)]
+    if why:
+        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {why}"), *spoilt))
+    known = grade(fit.sigma / SCALES["s"])
+    if known == "not observable":
+        text = f"not observable: its sigma would be {fit.sigma * 1e3:.2g} ms; {_advice(fit)}"
+        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: {text}"), *spoilt))
+    reasons = []
+    if known == "weak":
+        reasons.append(Reason(Verdict.CHECK, f"{name}: weak: known to {fit.sigma * 1e3:.2g} ms only; {_advice(fit)}"))
+    reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in _doubts(of, to, fit)]
+    return Judged(Status(known), (*reasons, *spoilt))
+
+
+def rates(fit: TimeOffsetFit) -> tuple[float, float]:
+    """Return the median and the greatest rate of the turns, rad/s (99.5th percentile: not an outlier's)."""
+    turns = [part.stretch.turns for part in fit.alignment.parts]
+    rate = np.concatenate([np.linalg.norm(each.angle, axis=1) / each.duration for each in turns])
+    return float(np.median(rate)), float(np.percentile(rate, 99.5))
+
+
+def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
+    """Say why the recording does not tell the offset, or nothing."""
+    track = fit.alignment.track
+    known = track.rate[track.chain >= 0]
+    middle, fast = rates(fit)
+    change = _change(fit)
+    if fit.gain < _ALIKE or fit.noise_share > _PRETENDED or fit.depth < _BOWL:
+        if fast < _STILL or float(np.median(np.linalg.norm(known, axis=1))) < _STILL:
+            return f"the rig hardly turns ({middle:.2g} rad/s in the middle): at rest every offset fits alike; {_MOTION}"
+        if fit.gain < _ALIKE and change > 0.3:
+            return (
+                f"{of} and {to} never turn alike at any offset: are both on one rigid body, do they overlap in time, is a topic wrong, "
+                "or are the poses those of the world seen from the sensor (--inverse-poses)?"
+            )
+        return f"the rate of turn hardly changes (about {middle:.2g} rad/s): a constant rate fits every offset alike; {_MOTION}"
+    return ""
+
+
+def _change(fit: TimeOffsetFit) -> float:
+    """Return the rms of d omega / dt over the track, rad/s^2, its noise included."""
+    track = fit.alignment.track
+    every = max(1, round(0.1 / track.step))
+    rate, there = track.rate[::every], track.chain[::every] >= 0
+    steps = np.diff(rate, axis=0)[there[1:] & there[:-1]] / (every * track.step)
+    return float(np.sqrt(np.mean(np.sum(steps**2, axis=1)))) if len(steps) else 0.0
+
+
+def _advice(fit: TimeOffsetFit) -> str:
+    """Name the motion to add, and what it would bring: sigma goes with 1 / (rms of d omega / dt)."""
+    better = fit.sigma * min(1.0, _change(fit) / _GOOD_CHANGE)
+    return (
+        f"{_MOTION}: about {better * 1e3:.1g} ms" if better < 0.7 * fit.sigma else f"record longer: four times as long halves it; {_MOTION}"
+    )
+
+
+def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
+    found = []
+    td = fit.td * 1e3
+    k = int(np.argmin(fit.cost))
+    if not 1 < k < len(fit.cost) - 2:
+        found.append(
+            (Verdict.FAIL, f"the V has no bottom within {fit.tau[-1] * 1e3:.0f} ms of {td:+.1f} ms: the two streams do not fit together")
+        )
+    if fit.second is not None:
+        text = f"{fit.second * 1e3:+.3f} ms fits as well as {td:+.3f} ms: the motion repeats itself; turn irregularly, about several axes"
+        found.append((Verdict.FAIL, text))
+    clock = fit.clock
+    if clock is not None and clock.kind != "constant":
+        verdict = Verdict.FAIL if clock.jumps else Verdict.CHECK
+        rate = 1 / float(np.median(np.concatenate([part.stretch.turns.duration for part in fit.alignment.parts])))
+        found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, rate)]
+    if fit.alignment.levels.jitter > _JITTER_S**2:
+        jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
+        found.append((Verdict.CHECK, f"the stamps of {of} jitter by {jitter:.2g} ms: the residuals grow with the rate; stamp at exposure"))
+    if fit.start.unlike > _UNLIKE and fit.gain < 1e4:
+        found.append((Verdict.CHECK, f"{of} and {to} turn only partly alike: {100 * fit.start.unlike:.0f} % of the turns is noise"))
+    lost = 1 - fit.alignment.turns / max(fit.n_turns, 1)
+    if lost > _LOST:
+        found.append((Verdict.CHECK, f"{100 * lost:.0f} % of the turns of {of} contradict {to} and were given up: look at its poses"))
+    factor = float(fit.covariance.factors[0]) * float(np.sqrt(fit.covariance.variance_factor))
+    if factor > _WORSE:
+        text = f"it wanders by more than its noise within the recording (sigma {factor:.1f} times that of independent residuals, paid for)"
+        found.append((Verdict.CHECK, text))
+    found += [(Verdict.CHECK, text) for text in _axes(of, fit)]
+    return found
+
+
+def axis_offsets(fit: TimeOffsetFit) -> tuple[Array, Array]:
+    """Return the offset that each measured axis of the turns would have by itself, less the common one, and its sigma, (d,) s."""
+    a = fit.alignment
+    parts = columns(a)
+    S, g, _ = epochs(a, parts, by_axis=True)
+    information = S.sum(axis=0)
+    scale = float(np.sqrt(fit.covariance.corrected[0, 0] / fit.covariance.plain[0, 0])) * np.sqrt(fit.covariance.variance_factor)
+    return g.sum(axis=0) / information, scale / np.sqrt(information)
+
+
+def _axes(of: str, fit: TimeOffsetFit) -> list[str]:
+    """Say so where the axes disagree: a rolling shutter, or poses that are wrong in a way that goes with the motion."""
+    if len(fit.alignment.R) != 3:
+        return []
+    off, sigma = axis_offsets(fit)
+    if float(np.sum((off / sigma) ** 2)) < _APART:
+        return []
+    each = ", ".join(f"{axis} {1e3 * (fit.td + d):+.2f} +- {1e3 * s:.2g}" for axis, d, s in zip("xyz", off, sigma, strict=True))
+    return [f"the axes of {of} disagree: {each} ms: a rolling shutter, or poses whose errors go with the motion"]
+
+
+def about_stamps(sensor: str, report: StampReport) -> list[str]:
+    """Return what is wrong with the stamps of a sensor, with sizes."""
+    said = []
+    if report.duplicates:
+        said.append(f"{counted(report.duplicates, 'stamp repeats', 'stamps repeat')} another one; of each the first frame counts")
+    if report.missing_share > _MISSING:
+        share = f"{100 * report.missing_share:.0f} % of the frames are missing ({report.missing} of {report.expected})"
+        said.append(share if report.rate_hz is None else f"{share}, the rate is {report.rate_hz:.4g} Hz")
+    if report.jitter_s is not None and report.jitter_s > _JITTER_S:
+        sigma = "" if report.jitter_sigma_s is None else f" +- {report.jitter_sigma_s * 1e3:.1g}"
+        said.append(f"its stamps lie {report.jitter_s * 1e3:.2g}{sigma} ms rms off a regular grid")
+    if report.bursts:
+        said.append("its stamps come in bursts: they are times of arrival; use the sensor's own clock")
+    if report.backward:
+        said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time; they were sorted")
+    return [f"{sensor}: {text}" for text in said]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.data.progress import Progress, silent
 from calibkit.estimation.clock import Clock
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.turn_comparison import (
@@ -85,10 +86,10 @@ def weighed(a: Alignment) -> Alignment:
     return replace(a, parts=tuple(parts))
 
 
-def settle(a: Alignment, levels: NoiseLevels | None) -> Alignment:
+def settle(a: Alignment, levels: NoiseLevels | None, progress: Progress = silent) -> Alignment:
     """Return the optimum with noise levels of its own (unless given) and without turns that are none."""
     first = True
-    for _ in range(_ROUNDS):
+    for _ in progress(range(_ROUNDS), "laying turns side by side"):
         if not first:
             a = newton(a)
         kept = _without_outliers(a, robust=first)
@@ -120,7 +121,7 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
     squares = []
     for stretch, keep in zip(a.stretches, a.keep, strict=True):
         shift = a.shift(stretch.t)
-        turned, _, _ = stretch.beta(a.track, shift[:, None])
+        turned = stretch.beta(a.track, shift[:, None])
         left = stretch.turns.angle[:, stretch.axes] - turned[:, 0] @ a.R.T
         own = biases.get(stretch.middle[keep][0]) if keep.any() else None
         rate = left / stretch.turns.duration[:, None]
@@ -157,10 +158,10 @@ def _gram(parts: Sequence[Array]) -> Array:
     return np.asarray(sum((X.T @ X for X in parts), np.zeros((5, 5))), np.float64)
 
 
-def sweep(a: Alignment, tau: Array) -> Array:
+def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
     """Return the V (k,): chi-squared with tau in place of the alignment's, the clock's drift kept, the best rotation and biases at each."""
     cost, gram = np.zeros(len(tau)), np.zeros((len(tau), 4, 4))
-    for part in a.parts:
+    for part in progress(a.parts, "the V", len(a.parts)):
         stretch = part.stretch
         drift = a.shift(stretch.t) - a.tau
         many = max(1, _SLAB // (16 * len(stretch.t)))
@@ -199,10 +200,10 @@ def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, fl
     return float(stretch.t[0]), float(stretch.t[-1]), at + extra, information**-0.5
 
 
-def turned_alike(a: Alignment) -> float:
+def turned_alike(a: Alignment, parts: Sequence[Array]) -> float:
     """Return by how much chi-squared is lower with the track's turns than without: below nothing where the track has noise alone."""
     without = sum(float(np.sum(part.clean(part.stretch.turns.angle[:, part.stretch.axes]) ** 2)) for part in a.parts)
-    return without - sum(float(np.sum(X[:, -1] ** 2)) for X in columns(a))
+    return without - sum(float(np.sum(X[:, -1] ** 2)) for X in parts)
 
 
 def noise_information(a: Alignment) -> float:

@@ -6,6 +6,7 @@ samples does not depend on where between them it is read (linear interpolation w
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,23 +36,35 @@ class OrientationTrack:
     delta: Array  # (g - 1, 3) rotation vector from each grid point to the next
     reach: float  # s to either side that each point is smoothed over
 
-    @property
-    def duration(self) -> float:
-        return self.step * (len(self.q) - 1)
+    @cached_property
+    def bend(self) -> Array:
+        """Return (g - 1, 3) rad: by how much the way between two grid points would overshoot at the rate of its start, over four."""
+        return np.asarray((0.5 * self.step) * (self.rate[:-1] - self.rate[1:]), np.float64)
 
-    def at(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return orientations (..., 4), rates (..., 3) and chains (...) at seconds from the origin; chain -1 where nothing is known.
+    def orientation(self, t: Array) -> Array:
+        """Return orientations (..., 4) at seconds from the origin; outside, those of the ends.
 
         Between grid points the rate is linear: phi(f) = f delta + f (1 - f) / 2 step (rate_0 - rate_1).
         """
-        place = np.asarray(t, float) / self.step
-        inside = (place >= 0) & (place <= len(self.q) - 1)
-        cell = np.clip(place, 0, len(self.q) - 2).astype(np.int64)
-        f = np.where(inside, place - cell, 0.0)[..., None]
-        before, after = self.rate[cell], self.rate[cell + 1]
-        phi = f * self.delta[cell] + (0.5 * self.step) * f * (1 - f) * (before - after)
-        chain = np.where(inside & (self.chain[cell] == self.chain[cell + 1]), self.chain[cell], -1)
-        return so3.quat_multiply(self.q[cell], so3.quat_exp(phi)), (1 - f) * before + f * after, chain
+        cell, f = self._place(t)
+        phi = f * (self.delta[cell] + (1 - f) * self.bend[cell])
+        return so3.quat_multiply(self.q[cell], so3.quat_exp(phi))
+
+    def rate_at(self, t: Array) -> Array:
+        """Return rates (..., 3) at seconds from the origin."""
+        cell, f = self._place(t)
+        return np.asarray((1 - f) * self.rate[cell] + f * self.rate[cell + 1], np.float64)
+
+    def chain_at(self, t: Array) -> NDArray[np.int64]:
+        """Return the chain (...) that seconds from the origin belong to; -1 where nothing is known."""
+        cell, _ = self._place(t)
+        inside = (t >= 0) & (t <= self.step * (len(self.q) - 1))
+        return np.where(inside & (self.chain[cell] == self.chain[cell + 1]), self.chain[cell], -1)
+
+    def _place(self, t: Array) -> tuple[NDArray[np.int64], Array]:
+        place = np.clip(np.asarray(t, float) / self.step, 0, len(self.q) - 1)
+        cell = np.minimum(place.astype(np.int64), len(self.q) - 2)
+        return cell, (place - cell)[..., None]
 
 
 def track_of_gyro(samples: ImuSamples, bias: Array | None = None) -> OrientationTrack:

@@ -109,14 +109,14 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
     if not starts:
         raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
     start, reach = starts[0], settings.reach_s
-    a = settle(_begin(turns, track, start, settings, reach), settings.levels)
+    a = settle(_begin(turns, track, start, settings, reach), settings.levels, progress)
     bias = _bias(a)
     if isinstance(reference, ImuSamples) and np.linalg.norm(bias) > _BIAS:
         a = newton(replace(a, track=track_of_gyro(reference, bias)))
     a, windows = _with_clock(a, settings, reach)
     while True:
         tau: Array = settings.step_s * np.arange(-round(reach / settings.step_s), round(reach / settings.step_s) + 1, dtype=float)
-        cost = sweep(a, tau)
+        cost = sweep(a, tau, progress)
         k = int(np.argmin(cost))
         inside = 2 <= k < len(tau) - 2
         if inside and abs(tau[k] - a.tau) <= 2 * settings.step_s:
@@ -126,7 +126,8 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         reach = min(2 * reach, _MAX_REACH_S)
         a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]))
         a, windows = _with_clock(settle(a, settings.levels), settings, reach)
-    covariance, interval = _trust(a)
+    parts = columns(a)
+    covariance, interval = _trust(a, parts)
     pretended = noise_information(a) * float(covariance.plain[0, 0]) / covariance.variance_factor
     fit = TimeOffsetFit(
         alignment=a,
@@ -141,7 +142,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         clock=a.clock,
         gyro_bias=_bias(a),
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
-        gain=turned_alike(a) / _inflation(covariance),
+        gain=turned_alike(a, parts) / _inflation(covariance),
         noise_share=min(pretended, 1.0),
     )
     return replace(fit, second=_second(fit, starts[1:]))
@@ -198,9 +199,8 @@ def _bias(a: Alignment) -> Array:
     return np.asarray(-a.R.T @ np.mean(found, axis=0), np.float64) if found and len(a.R) == 3 else np.zeros(3)
 
 
-def _trust(a: Alignment) -> tuple[Covariance, tuple[float, float]]:
+def _trust(a: Alignment, parts: Sequence[Array]) -> tuple[Covariance, tuple[float, float]]:
     """Return the covariance of tau, and the 95 % interval: where the V has risen by chi-squared's 3.84, correlation paid for."""
-    parts = columns(a)
     S, g, t = epochs(a, parts)
     rows = sum(len(X) for X in parts)
     unknowns = 1 + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)

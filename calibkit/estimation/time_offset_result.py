@@ -195,11 +195,11 @@ def _turn_rows(a: Alignment, i: int, coarse: float) -> dict[str, Array]:
     duration = stretch.turns.duration[:, None]
 
     def left(shift: Array) -> tuple[Array, Array]:
-        turned, _, _ = stretch.beta(a.track, shift[:, None])
+        turned = stretch.beta(a.track, shift[:, None])
         residual = stretch.turns.angle[:, stretch.axes] / duration - turned[:, 0] / duration @ a.R.T
         out = np.zeros((len(residual), 3))
         out[:, stretch.axes] = residual - np.median(residual, axis=0)  # the bias
-        known = a.track.at(stretch.middle + shift[stretch.turns.first])[2] >= 0
+        known = a.track.chain_at(stretch.middle + shift[stretch.turns.first]) >= 0
         rate = np.linalg.norm(turned[:, 0] / duration, axis=1)
         return np.where(known[:, None], out, np.nan), np.where(known, rate, np.nan)
 

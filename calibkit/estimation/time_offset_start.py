@@ -55,7 +55,7 @@ def _try(turns: Turns, track: OrientationTrack, rotation: Array | None, candidat
         return None
     tau = np.arange(-reach, reach + _STEP_S / 2, _STEP_S)
     stretch = Stretch(part, track.origin_ns)
-    beta, _, _ = stretch.beta(track, np.broadcast_to(tau, (len(part.t_ns), len(tau))))
+    beta = stretch.beta(track, np.broadcast_to(tau, (len(part.t_ns), len(tau))))
     alpha = part.angle[:, None, stretch.axes]
     apart = np.abs(np.linalg.norm(alpha, axis=2) - np.linalg.norm(beta, axis=2))
     spread = 1.5 * np.median(apart, axis=0) + 1e-12

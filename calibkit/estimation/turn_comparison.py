@@ -47,18 +47,15 @@ class Stretch:
     def axes(self) -> NDArray[np.intp]:
         return np.flatnonzero(self.turns.axes)
 
-    def beta(self, track: OrientationTrack, shift: Array) -> tuple[Array, Array, Array]:
-        """Return the track's turns (n, k, 3) at stamps shifted by `shift` (m, k) s, and its rates at their starts and ends."""
-        q, rate, _ = track.at(self.t[:, None] + shift)
-        first, last = self.turns.first, self.turns.last
-        turned = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[first]), q[last]))
-        return turned, rate[first], rate[last]
+    def beta(self, track: OrientationTrack, shift: Array) -> Array:
+        """Return the track's turns (n, k, 3) between stamps shifted by `shift` (m, k) s."""
+        q = track.orientation(self.t[:, None] + shift)
+        return so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[self.turns.first]), q[self.turns.last]))
 
     def noise(self, track: OrientationTrack, R: Array, shift: Array, shape: Array) -> TurnNoise:
         """Return the noise of its turns, its sensor turning at R omega."""
-        _, rate, _ = track.at(self.t + shift)
         omega = np.zeros((len(self.t), 3))
-        omega[:, self.axes] = rate @ R.T
+        omega[:, self.axes] = track.rate_at(self.t + shift) @ R.T
         return turn_noise(self.turns, omega, shape)
 
 
@@ -106,7 +103,7 @@ def weigh(stretch: Stretch, noise: TurnNoise, levels: NoiseLevels) -> Weighed:
 
 def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> tuple[Array, Array]:
     """Return alpha - R beta - c duration (n, d) rad at one shift (m,), and the bias c (d,) rad/s."""
-    turned, _, _ = part.stretch.beta(track, shift[:, None])
+    turned = part.stretch.beta(track, shift[:, None])
     left = _left(part.stretch, turned, R)[:, 0]
     if not len(part.root):
         return left, np.zeros(left.shape[1])
@@ -116,7 +113,7 @@ def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array
 
 def residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
     """Return whitened residuals (rows, k) for shifts (m, k)."""
-    turned, _, _ = part.stretch.beta(track, shift)
+    turned = part.stretch.beta(track, shift)
     return part.clean(_left(part.stretch, turned, R).swapaxes(1, 2))
 
 
@@ -125,7 +122,7 @@ def residual_columns(part: Weighed, track: OrientationTrack, R: Array, shift: Ar
 
     R -> exp(hat(d)) R moves R beta by -hat(R beta) d; of a sensor with one axis R is that axis (1, 3), free in length, and moves by d.
     """
-    turned, _, _ = part.stretch.beta(track, shift)
+    turned = part.stretch.beta(track, shift)
     return part.clean(_columns(part.stretch, turned, R))
 
 
@@ -149,9 +146,11 @@ def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -
     d beta / d shift = J_r(beta)^-1 omega_last - J_l(beta)^-1 omega_first.
     """
     stretch = part.stretch
-    turned, before, after = stretch.beta(track, shift[:, None])
+    turned = stretch.beta(track, shift[:, None])
+    rate = track.rate_at(stretch.t + shift)[:, None, :, None]
+    before, after = rate[stretch.turns.first], rate[stretch.turns.last]
     inverse = np.linalg.inv(so3.right_jacobian(turned))
-    slope: Array = (inverse @ after[..., None] - np.swapaxes(inverse, 2, 3) @ before[..., None])[..., 0] @ R.T
+    slope: Array = (inverse @ after - np.swapaxes(inverse, 2, 3) @ before)[..., 0] @ R.T
     columns = _columns(stretch, turned, R)[:, :, 0]
     together: Array = np.concatenate([columns[..., :3], slope.swapaxes(1, 2), columns[..., 3:]], axis=2)
     return part.clean(together)

@@ -104,10 +104,14 @@ def quat_exp(v: Array) -> Array:
 
 def quat_multiply(p: Array, q: Array) -> Array:
     """Return p q, Hamilton's product of quaternions xyzw: the rotation q first, then p; shapes broadcast."""
-    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
-    vector = [d * x + a * w + b * z - c * y, d * y + b * w + c * x - a * z, d * z + c * w + a * y - b * x]
-    product: Array = np.stack([*vector, d * w - a * x - b * y - c * z], axis=-1)
-    return product
+    out = np.empty(np.broadcast_shapes(p.shape, q.shape))
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out[..., 0] = d * x + a * w + b * z - c * y
+    out[..., 1] = d * y + b * w + c * x - a * z
+    out[..., 2] = d * z + c * w + a * y - b * x
+    out[..., 3] = d * w - a * x - b * y - c * z
+    return out
 
 
 def quat_conjugate(q: Array) -> Array:

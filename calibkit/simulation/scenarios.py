@@ -23,6 +23,7 @@ class Scenario:
     board: Board
     imu: SimImu | None = field(default_factory=SimImu)
     motion: str = "rich"  # a key of trajectory.MOTIONS
+    speed: float = 1.0  # that motion's path, so many times as fast
     distance: float = 0.75  # m, of the board from the resting camera
     duration_s: float = 30.0
     style: RenderStyle = field(default_factory=RenderStyle)

@@ -74,7 +74,7 @@ def simulate_session(scenario: Scenario, seed: int = 0) -> Session:
     """Return the scenario's run with this seed, without its faults (`faults.apply_faults`)."""
     rngs = [np.random.default_rng((seed, part, 0)) for part in (_MOTION, _IMU)]
     T_imu_cam = scenario.cameras[0].T_imu_cam
-    trajectory = make_trajectory(MOTIONS[scenario.motion], scenario.distance, T_imu_cam, rngs[0])
+    trajectory = make_trajectory(MOTIONS[scenario.motion].at_speed(scenario.speed), scenario.distance, T_imu_cam, rngs[0])
     T_cam_board = place_board(scenario.board, np.eye(3), np.array([0, 0, scenario.distance]))
     imu, imu_truth, imu_times = None, None, np.zeros(0, np.int64)
     if scenario.imu is not None:

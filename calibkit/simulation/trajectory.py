@@ -61,6 +61,14 @@ class Motion:
     sines: tuple[tuple[float, float, float, float, float, float, float], ...] = ()
     velocity: tuple[float, float, float, float, float, float] = (0, 0, 0, 0, 0, 0)  # per s
 
+    def at_speed(self, speed: float) -> "Motion":
+        """Return the same path taken `speed` times as fast: rates of turn grow with it, accelerations with its square."""
+        a, b, c, d, e, f = self.velocity
+        return Motion(
+            tuple((speed * hz, x, y, z, pitch, yaw, roll) for hz, x, y, z, pitch, yaw, roll in self.sines),
+            (speed * a, speed * b, speed * c, speed * d, speed * e, speed * f),
+        )
+
 
 # A step to the right with a turn to the left, by the same angle, keeps the board in view and shows it tilted.
 _ORBIT = (
@@ -96,6 +104,9 @@ MOTIONS: dict[str, Motion] = {
         )
     ),
     "single-axis": Motion(((0.23, 0, 0, 0, 0, 0.30, 0), (0.71, 0, 0, 0, 0, 0.12, 0))),
+    # About the optical axis, so that the board stays in view: a swing that repeats itself, and a turn at one rate for ever.
+    "swing": Motion(((1.0, 0, 0, 0, 0, 0, 0.25),)),
+    "constant-rate": Motion(velocity=(0, 0, 0, 0, 0, 1.0)),
     "constant-velocity": Motion(velocity=(0.01, -0.006, 0.008, 0, 0, 0)),
     # A vehicle on flat ground: it moves in its plane and turns about the vertical.
     "planar": Motion((_ORBIT[0], _WANDER[0], _WANDER[1], _SHAKE[0], _SHAKE[2], _SHAKE[4])),

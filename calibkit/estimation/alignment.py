@@ -17,10 +17,8 @@ from calibkit.estimation.turn_comparison import (
     linearised,
     moved,
     raw_residuals,
-    residual_columns,
     residuals,
     weigh,
-    without_rotation,
 )
 from calibkit.estimation.turn_noise import NoiseLevels, estimate_levels
 from calibkit.geometry.so3 import Array
@@ -159,20 +157,23 @@ def _gram(parts: Sequence[Array]) -> Array:
 
 
 def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
-    """Return the V (k,): chi-squared with tau in place of the alignment's, the clock's drift kept, the best rotation and biases at each."""
-    cost, gram = np.zeros(len(tau)), np.zeros((len(tau), 4, 4))
+    """Return the V (k,): chi-squared with tau in place of the alignment's, the clock's drift kept, the best rotation and biases at each.
+
+    The rotation is eliminated as it acts at the alignment's own tau: y.y - (X^T y).(X^T X)^-1 (X^T y).
+    """
+    square, pull, H = np.zeros(len(tau)), np.zeros((3, len(tau))), np.diag(_PRIOR[:3])
     for part in progress(a.parts, "the V", len(a.parts)):
-        stretch = part.stretch
-        drift = a.shift(stretch.t) - a.tau
-        many = max(1, _SLAB // (16 * len(stretch.t)))
+        t = part.stretch.t
+        shift = a.shift(t)
+        X = linearised(part, a.track, a.R, shift)[:, :3] * a.free_rotation
+        H += X.T @ X
+        many = max(1, _SLAB // (16 * len(t)))
         for i in range(0, len(tau), many):
-            shift = drift[:, None] + tau[i : i + many]
-            if a.free_rotation:
-                X = np.moveaxis(residual_columns(part, a.track, a.R, shift), 1, 0)
-                gram[i : i + many] += np.swapaxes(X, 1, 2) @ X
-            else:
-                cost[i : i + many] += np.sum(residuals(part, a.track, a.R, shift) ** 2, axis=0)
-    return without_rotation(gram)[0] if a.free_rotation else cost
+            here = slice(i, i + many)
+            y = residuals(part, a.track, a.R, (shift - a.tau)[:, None] + tau[here])
+            square[here] += np.sum(y**2, axis=0)
+            pull[:, here] += X.T @ y
+    return np.asarray(square - np.sum(pull * np.linalg.solve(H, pull), axis=0), np.float64)
 
 
 def window_offsets(a: Alignment, reach: float) -> Windows:
@@ -207,21 +208,11 @@ def turned_alike(a: Alignment, parts: Sequence[Array]) -> float:
 
 
 def noise_information(a: Alignment) -> float:
-    """Return the information on tau that noise of the track's rates would pretend, in mean, if they did not change at all.
-
-    Measured with rates of that noise (third differences: var / 20), drawn at the stamps.
-    """
-    every = max(1, round(2 * a.track.reach / a.track.step))
-    rate = a.track.rate[::every]
-    steady = a.track.chain[::every] >= 0
-    third = np.diff(rate, 3, axis=0)[steady[3:] & steady[2:-1] & steady[1:-2] & steady[:-3]]
-    if not len(third):
-        return 0.0
-    sigma = 1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20)
+    """Return the information on tau that noise of the track's rates would pretend, in mean over draws, if they did not change at all."""
     rng = np.random.default_rng(0)
     total = 0.0
     for part in a.parts:
-        drawn = sigma * rng.standard_normal((_DRAWS, len(part.stretch.t), 3)) @ a.R.T
+        drawn = a.track.rate_sigma * rng.standard_normal((_DRAWS, len(part.stretch.t), 3)) @ a.R.T
         change = drawn[:, part.stretch.turns.last] - drawn[:, part.stretch.turns.first]
         total += float(np.sum(part.clean(np.moveaxis(change, 0, 2)) ** 2)) / _DRAWS
     return total

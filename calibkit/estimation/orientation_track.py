@@ -34,7 +34,7 @@ class OrientationTrack:
     rate: Array  # (g, 3) rad/s
     chain: NDArray[np.int64]  # (g,) orientations of different chains cannot be compared; -1 where there is none
     delta: Array  # (g - 1, 3) rotation vector from each grid point to the next
-    reach: float  # s to either side that each point is smoothed over
+    rate_sigma: Array  # (3,) rad/s, noise of the rates after smoothing
 
     @cached_property
     def bend(self) -> Array:
@@ -79,7 +79,7 @@ def track_of_gyro(samples: ImuSamples, bias: Array | None = None) -> Orientation
     h = np.diff(t_ns)[:, None] * 1e-9
     steps = h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12
     parted = np.concatenate([[0], np.cumsum(h[:, 0] > max(_HELD * float(np.median(h)), 2 * _LEAST_REACH_S))])
-    return _smooth(t_ns, accumulate(so3.quat_exp(steps)), parted)
+    return _smooth(t_ns, accumulate(so3.quat_exp(steps)), parted, _noise(rate, 5), walked=True)
 
 
 def track_of_poses(poses: PoseSamples) -> OrientationTrack:
@@ -87,7 +87,14 @@ def track_of_poses(poses: PoseSamples) -> OrientationTrack:
     order = in_order(poses.t_ns)
     if len(order) < 10:
         raise BadInputError(f"{len(order)} poses are too few to follow a motion: record 10 s or more")
-    return _smooth(poses.t_ns[order], poses.q[order], np.zeros(len(order), np.int64))
+    t_ns, q = poses.t_ns[order], poses.q[order]
+    steps = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[:-1]), q[1:]))
+    return _smooth(t_ns, q, np.zeros(len(order), np.int64), _noise(steps, 4), walked=False)
+
+
+def _noise(values: Array, order: int) -> Array:
+    """Return sigma (3,) of white noise in values that are differenced to the fifth order in all: motion is smooth, and drops out."""
+    return np.asarray(1.4826 * np.median(np.abs(np.diff(values, order, axis=0)), axis=0) / np.sqrt(252), np.float64)
 
 
 def accumulate(q: Array) -> Array:
@@ -107,22 +114,29 @@ def accumulate(q: Array) -> Array:
     return np.concatenate([identity[None], padded[: len(q)]])
 
 
-def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64]) -> OrientationTrack:
+def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64], sigma: Array, walked: bool) -> OrientationTrack:
+    """Return the track through orientations with noise sigma (3,) rad; `walked`: through sums of rates with noise sigma rad/s."""
     t: Array = np.asarray((t_ns - t_ns[0]) * 1e-9, np.float64)
     interval = float(np.median(np.diff(t)))
     reach = max(_REACH * interval, _LEAST_REACH_S)
     step = float(np.clip(interval, *_STEP_S))
     grid: Array = np.arange(int(t[-1] / step) + 1, dtype=float) * step
     parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval) for i in range(0, len(grid), _CHUNK)]
-    fitted, rate, chain = (np.concatenate(each) for each in zip(*parts, strict=True))
+    fitted, rate, chain, weights = (np.concatenate(each) for each in zip(*parts, strict=True))
     delta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[:-1]), fitted[1:]))
-    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, reach)
+    if walked:  # what an orientation takes of each rate: of all before it
+        weights = interval * np.cumsum(weights[:, ::-1], axis=1)[:, :-1]
+    gain = float(np.sqrt(np.median(np.sum(weights**2, axis=1))))
+    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, gain * sigma)
 
 
 def _regress(
     grid: Array, t: Array, q: Array, parted: NDArray[np.int64], reach: float, interval: float
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return orientation, rate and chain at the grid's instants: v(s) = v0 + v1 s + v2 s^2 by least squares, v = log(q_nearest^-1 q)."""
+) -> tuple[Array, Array, NDArray[np.int64], Array]:
+    """Return orientation, rate and chain at the grid's instants, and what of the neighbours' orientations is in the rate, (g, k) 1/s.
+
+    v(s) = v0 + v1 s + v2 s^2 by least squares, v = log(q_nearest^-1 q).
+    """
     most = int(np.ceil(reach / interval)) + 1
     centre = np.clip(np.searchsorted(t, grid), 0, len(t) - 1)
     near = centre[:, None] + np.arange(-most, most + 1)
@@ -142,4 +156,4 @@ def _regress(
     v = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[centre])[:, None], q[near]))
     v0, v1 = np.moveaxis(rows @ v, 1, 0)
     rate = (so3.right_jacobian(v0) @ (v1 / reach)[..., None])[..., 0]
-    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[centre], -1)
+    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[centre], -1), rows[:, 1] / reach

@@ -117,55 +117,32 @@ def residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) ->
     return part.clean(_left(part.stretch, turned, R).swapaxes(1, 2))
 
 
-def residual_columns(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
-    """Return whitened columns (rows, k, 4) for shifts (m, k): what the rotation moves predictions by (3), and the residuals.
-
-    R -> exp(hat(d)) R moves R beta by -hat(R beta) d; of a sensor with one axis R is that axis (1, 3), free in length, and moves by d.
-    """
-    turned = part.stretch.beta(track, shift)
-    return part.clean(_columns(part.stretch, turned, R))
-
-
 def _left(stretch: Stretch, turned: Array, R: Array) -> Array:
     """Return alpha - R beta (n, k, d)."""
     return np.asarray(stretch.turns.angle[:, None, stretch.axes] - turned @ R.T, np.float64)
 
 
-def _columns(stretch: Stretch, turned: Array, R: Array) -> Array:
-    """Return (n, d, k, 4)."""
-    predicted = turned @ R.T
-    slope = -so3.hat(predicted) if len(R) == 3 else turned[:, :, None]
-    left = stretch.turns.angle[:, None, stretch.axes] - predicted
-    together: Array = np.concatenate([slope, left[..., None]], axis=3).swapaxes(1, 2)
-    return together
-
-
 def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
     """Return whitened columns (rows, 5) at one shift (m,): what rotation (3) and offset move predictions by, and the residuals.
 
+    R -> exp(hat(d)) R moves R beta by -hat(R beta) d; of a sensor with one axis R is that axis (1, 3), free in length, and moves by d.
     d beta / d shift = J_r(beta)^-1 omega_last - J_l(beta)^-1 omega_first.
     """
     stretch = part.stretch
-    turned = stretch.beta(track, shift[:, None])
-    rate = track.rate_at(stretch.t + shift)[:, None, :, None]
-    before, after = rate[stretch.turns.first], rate[stretch.turns.last]
+    turned = stretch.beta(track, shift[:, None])[:, 0]
+    predicted = turned @ R.T
+    tilt = -so3.hat(predicted) if len(R) == 3 else turned[:, None]
+    rate = track.rate_at(stretch.t + shift)[..., None]
     inverse = np.linalg.inv(so3.right_jacobian(turned))
-    slope: Array = (inverse @ after - np.swapaxes(inverse, 2, 3) @ before)[..., 0] @ R.T
-    columns = _columns(stretch, turned, R)[:, :, 0]
-    together: Array = np.concatenate([columns[..., :3], slope.swapaxes(1, 2), columns[..., 3:]], axis=2)
+    slope = R @ (inverse @ rate[stretch.turns.last] - np.swapaxes(inverse, 1, 2) @ rate[stretch.turns.first])
+    left = (stretch.turns.angle[:, stretch.axes] - predicted)[..., None]
+    together: Array = np.concatenate([tilt, slope, left], axis=2)
     return part.clean(together)
 
 
 def moved(R: Array, d: Array) -> Array:
     """Return the rotation, or the one axis, moved by d (3,)."""
     return so3.exp(d) @ R if len(R) == 3 else R + d
-
-
-def without_rotation(grams: Array) -> tuple[Array, Array]:
-    """Return the cost (k,) left of Gram matrices (k, 4, 4) of `residual_columns` once the rotation is eliminated, and its step (k, 3)."""
-    step = np.asarray(np.linalg.solve(grams[:, :3, :3] + np.eye(3) / TILT**2, grams[:, :3, 3:])[:, :, 0], np.float64)
-    cost: Array = grams[:, 3, 3] - np.sum(step * grams[:, :3, 3], axis=1)
-    return cost, step
 
 
 def usable(turns: Turns, track: OrientationTrack, low: float, high: float) -> Mask:

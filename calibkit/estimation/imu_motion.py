@@ -121,13 +121,14 @@ def _throughout(w: Windows, moved: Mask) -> list[Finding]:
 def check_levels(w: Windows, disturbed: Mask) -> list[Finding]:
     """Find steps and ramps of the level that no motion explains, as changes of temperature make them."""
     found: list[_Change] = []
+    rounding = 100 * np.finfo(float).eps * np.abs(w.mean).max(axis=0) + 1e-30  # all that a stuck axis shows
     for scale_s in _SCALES_S:
         half = max(round(scale_s / w.step_s), 1)
-        change, known = _change(w.mean, half), ~_any_within(disturbed, 2 * half)
+        change, known = _change(w.mean - w.mean[0], half), ~_any_within(disturbed, 2 * half)
         if np.sum(known) < 20 * half:
             break
         middle = np.median(change[known], axis=0)
-        spread = np.maximum(_MAD * np.median(np.abs(change[known] - middle), axis=0), 1e-30)
+        spread = np.maximum(_MAD * np.median(np.abs(change[known] - middle), axis=0), rounding)
         limit = _SIGMAS * (1 + 4 / np.sqrt(np.sum(known) / half)) * spread  # a spread from few is itself uncertain
         excess = np.where(known[:, None], np.abs(change - middle) / limit, 0)
         for first, last in _runs(np.any(excess > 1, axis=1), 2 * half):

@@ -21,6 +21,8 @@ FEWEST = 4  # windows; below, nothing is said of the clock
 _CONFIDENT = 1.96  # 95 %
 _SIGNIFICANT = 4.0  # sigmas: the price of a skew
 _WORSE = 1.3  # scatter that is worth telling
+_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
+_JUMPS_TOLD = 5  # one by one
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Clock:
     middle_s: float
     half_s: float
     jumps: tuple[Jump, ...]
-    scatter: float  # of the windows over their sigmas, 1 or more
+    scatter: float  # robust sigma of the windows around the clock over their own sigmas, 1 or more
     gain: float  # -2 ln likelihood below that of a constant clock
     price: float  # what the gain had to exceed; 0 for a constant clock
     span_s: float  # from the first window's start to the last one's end
@@ -102,7 +104,7 @@ def _clock(windows: Windows, fit: Fit, constant: Fit) -> Clock:
         fit = skewed  # a skew too small to be seen would make the jumps' sizes wrong by more than their sigmas
     skew_of = np.where(np.arange(skewed.beta.size) % 2, 1.0, 0.0) / windows.half_s  # P_k(1) - P_k(-1) = 2 for odd k
     skew_of[1 + sloped.degree :] = 0
-    skew, skew_sigma = float(skew_of @ skewed.beta), sigma_of(windows, skewed, skew_of) if n > 1 else np.inf
+    skew, skew_sigma = float(skew_of @ skewed.beta), sigma_of(windows, skewed, skew_of) if windows.t_s[-1] > windows.t_s[0] else np.inf
     places = [_interval(windows, fit, k) for k in chosen.steps]
     t_ref = float(np.average(windows.t_s, weights=windows.sigma**-2.0))  # there, offset and skew do not depend on each other
     after = [float(t_ref >= (low + high) / 2) for low, high in places]
@@ -123,7 +125,7 @@ def _clock(windows: Windows, fit: Fit, constant: Fit) -> Clock:
             Jump((low + high) / 2, (high - low) / float(np.sqrt(12)), float(fit.beta[i]), sigma_of(windows, fit, np.eye(len(fit.beta))[i]))
             for i, (low, high) in enumerate(places, first)
         ),
-        scatter=fit.scatter,
+        scatter=max(1.0, _MAD * float(np.median(np.abs(fit.residual))) * float(np.sqrt(n / max(n - len(fit.beta), 1)))),
         gain=constant.cost - fit.cost,
         price=chosen.price(n),
         span_s=float(windows.end_s.max() - windows.start_s.min()),
@@ -150,20 +152,29 @@ def describe(clock: Clock, frame_hz: float | None = None) -> list[str]:
         return [f"too short to tell whether the clocks drift or jump: {counted(clock.n_windows, 'window')} of td, {FEWEST} are needed"]
     said = []
     if clock.drifts:
-        total = clock.skew * clock.span_s * 1e3
         least, greatest = clock.skew_range
         between = f", from {least * 1e6:+.1f} to {greatest * 1e6:+.1f} ppm" if len(clock.drift) > 1 else ""
-        skew = f"{clock.skew * 1e6:+.1f} +- {clock.skew_sigma * 1e6:.1f} ppm{between}"
-        said.append(f"the clock drifts: td changes by {skew} ({total:+.2g} ms over {clock.span_s:.3g} s)")
-    for jump in clock.jumps:
+        skew, total = _with_sigma(clock.skew * 1e6, clock.skew_sigma * 1e6), clock.skew * clock.span_s * 1e3
+        said.append(f"the clock drifts: td changes by {skew} ppm{between} ({total:+.3g} ms over {clock.span_s:.4g} s)")
+    told = clock.jumps if len(clock.jumps) <= _JUMPS_TOLD else clock.jumps[: _JUMPS_TOLD - 1]
+    for jump in told:
         cause = _frames(jump, frame_hz) or "dropped frames or a driver's re-sync"
-        said.append(f"the clock jumps: td changes by {jump.size_s * 1e3:+.1f} +- {jump.sigma_s * 1e3:.1f} ms at {jump.t_s:.1f} s ({cause})")
+        size = _with_sigma(jump.size_s * 1e3, jump.sigma_s * 1e3)
+        said.append(f"the clock jumps: td changes by {size} ms at {jump.t_s:.1f} s ({cause})")
+    if others := [jump.size_s * 1e3 for jump in clock.jumps[len(told) :]]:
+        said.append(f"{len(others)} more jumps, of {min(others):+.1f} to {max(others):+.1f} ms, the last at {clock.jumps[-1].t_s:.1f} s")
     if not said:
-        limit = f"{clock.skew_limit * 1e6:.2g} ppm ({clock.skew_limit * clock.span_s * 1e3:.2g} ms over {clock.span_s:.3g} s)"
+        limit = f"{clock.skew_limit * 1e6:.2g} ppm ({clock.skew_limit * clock.span_s * 1e3:.2g} ms over {clock.span_s:.4g} s)"
         said.append(f"the clocks keep step: no jump, and a drift is below {limit}")
     if clock.scatter > _WORSE:
         said.append(f"td of the windows scatters {clock.scatter:.1f} times as much as their sigmas say")
     return said
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Return both to the sigma's first digit that counts, tenths at least."""
+    digits = int(np.clip(np.ceil(-np.log10(max(sigma, 1e-6))), 1, 4))
+    return f"{value:+.{digits}f} +- {sigma:.{digits}f}"
 
 
 def _frames(jump: Jump, frame_hz: float | None) -> str:
@@ -174,4 +185,4 @@ def _frames(jump: Jump, frame_hz: float | None) -> str:
     whole = round(periods)
     if whole < 1 or abs(periods - whole) > max(3 * jump.sigma_s * frame_hz, 0.02):
         return ""
-    return f"{counted(whole, 'frame period')} of {frame_hz:.4g} Hz: frames numbered wrong after a drop, or a driver's re-sync"
+    return f"{counted(whole, 'frame period')} of {frame_hz:.4g} Hz: dropped frames or a driver's re-sync"

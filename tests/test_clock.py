@@ -1,0 +1,187 @@
+"""td over time: a constant clock is not taken for another, drifts and jumps are found with honest sigmas, and said in words."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calibkit.estimation.clock import Clock, describe, fit_clock
+
+Scatter = Callable[[np.random.Generator, int], np.ndarray]
+
+
+def _with_wrong(rng: np.random.Generator, w: int) -> np.ndarray:
+    return rng.normal(size=w) * np.where(rng.random(w) < 0.05, 30, 1)
+
+
+SCATTER: dict[str, Scatter] = {
+    "as told": lambda rng, w: rng.normal(size=w),
+    "1.5 times": lambda rng, w: 1.5 * rng.normal(size=w),
+    "heavy tails": lambda rng, w: rng.standard_t(3, size=w),
+    "1.5 times heavy tails": lambda rng, w: 1.5 * rng.standard_t(3, size=w),
+    "some wrong": _with_wrong,
+}
+
+
+def _windows(w: int, span_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    edges = np.linspace(0, span_s, w + 1)
+    return (edges[:-1] + edges[1:]) / 2, edges[:-1], edges[1:]
+
+
+def _clock(
+    w: int,
+    span_s: float,
+    sigma_s: float,
+    seed: int,
+    skew: float = 0.0,
+    jumps: tuple[tuple[float, float], ...] = (),
+    scatter: Scatter = SCATTER["as told"],
+) -> Clock:
+    """Fit windows of a clock; td of a window with a jump in its middle lies between, with an error of a fifth of the jump."""
+    rng = np.random.default_rng((seed, w))
+    t, start, end = _windows(w, span_s)
+    sigma = sigma_s * np.exp(0.3 * rng.normal(size=w))
+    td = 0.006 + skew * t + sigma * scatter(rng, w)
+    for at, size in jumps:
+        inside = (start < at - 1e-9) & (at + 1e-9 < end)
+        part = np.clip((end - at) / (end - start), 0, 1)
+        td += size * np.where(inside, np.clip(part + 0.2 * rng.normal(size=w), 0, 1), part)
+    return fit_clock(t, start, end, td, sigma)
+
+
+def _rms(errors: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _false_alarms(w: int, scatter: str, seeds: int) -> float:
+    t, start, end = _windows(w, 2.0 * w)
+    alarms = 0
+    for seed in range(seeds):
+        rng = np.random.default_rng((seed, w))
+        sigma = 1e-4 * np.exp(0.5 * rng.normal(size=w))
+        alarms += fit_clock(t, start, end, 0.005 + sigma * SCATTER[scatter](rng, w), sigma).kind != "constant"
+    return alarms / seeds
+
+
+@pytest.mark.parametrize("scatter", SCATTER)
+def test_a_constant_clock_is_constant(scatter: str) -> None:
+    assert np.mean([_false_alarms(w, scatter, 60) for w in (4, 6, 12, 30)]) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scatter", SCATTER)
+@pytest.mark.parametrize("w", [4, 6, 12, 30, 120, 360])
+def test_false_alarms_are_below_half_a_percent(w: int, scatter: str) -> None:
+    assert _false_alarms(w, scatter, 2000) < 0.005
+
+
+@pytest.mark.parametrize(("w", "sigma_s"), [(6, 5e-5), (12, 5e-5), (12, 3e-4), (30, 3e-4), (60, 3e-4)])
+def test_fifty_ppm_over_a_minute_are_found(w: int, sigma_s: float) -> None:
+    clocks = [_clock(w, 60, sigma_s, seed, skew=50e-6) for seed in range(30)]
+    assert {clock.kind for clock in clocks} == {"drifting"}
+    assert 0.6 < _rms([(clock.skew - 50e-6) / clock.skew_sigma for clock in clocks]) < 1.44
+    assert 0.6 < _rms([(clock.offset_s - 0.006 - 50e-6 * clock.t_ref_s) / clock.sigma_s for clock in clocks]) < 1.44
+
+
+@pytest.mark.parametrize("scatter", ["as told", "1.5 times heavy tails"])
+@pytest.mark.parametrize("skew", [0.0, 50e-6])
+@pytest.mark.parametrize("jumps", [((30.4, 0.033),), ((20.3, 0.033), (39.1, -0.033)), ((15.2, -0.033), (30.0, -0.033), (45.7, 0.05))])
+def test_jumps_are_found_with_and_without_a_skew(jumps: tuple[tuple[float, float], ...], skew: float, scatter: str) -> None:
+    errors = []
+    for seed in range(12):
+        clock = _clock(60, 60, 1e-4, seed, skew, jumps, SCATTER[scatter])
+        assert clock.kind == "jumping"
+        assert len(clock.jumps) == len(jumps)
+        for found, (at, size) in zip(clock.jumps, jumps, strict=True):
+            assert abs(found.t_s - at) <= 1.0
+            assert found.t_sigma_s <= 0.58
+            errors.append((found.size_s - size) / found.sigma_s)
+        errors.append((clock.skew - skew) / clock.skew_sigma)
+    assert 0.6 < _rms(errors) < 1.44
+
+
+def test_the_model_gives_td_back_at_any_time() -> None:
+    clock = _clock(60, 60, 1e-6, 0, 50e-6, ((30.0, 0.033),))
+    t = np.array([1.0, 29.0, 31.0, 59.0])
+    assert np.abs(clock.at(t) - (0.006 + 50e-6 * t + 0.033 * (t > 30))).max() < 2e-6
+    assert clock.at(np.array(clock.t_ref_s)) == pytest.approx(clock.offset_s, abs=1e-15)
+    assert clock.jumps[0].t_s == pytest.approx(30)
+
+
+def test_sign_and_order_and_a_distant_clock_change_nothing_else() -> None:
+    t, start, end = _windows(30, 60)
+    td = 50e-6 * t + np.where(t > 30, -0.033, 0) + 1e-4 * np.random.default_rng(0).normal(size=30)
+    sigma = np.full(30, 1e-4)
+    near, mirrored = fit_clock(t, start, end, td, sigma), fit_clock(t, start, end, -td, sigma)
+    assert near.jumps[0].size_s == pytest.approx(-0.033, abs=5e-4)
+    assert mirrored.skew == pytest.approx(-near.skew, rel=1e-6)
+    mixed = np.random.default_rng(1).permutation(30)
+    far = fit_clock(t[mixed] + 1e5, start[mixed] + 1e5, end[mixed] + 1e5, td[mixed] + 4583.0, sigma[mixed])
+    assert far.offset_s - 4583.0 == pytest.approx(near.offset_s, abs=1e-9)
+    assert (far.skew, far.jumps[0].size_s) == pytest.approx((near.skew, near.jumps[0].size_s), rel=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "every_s"), [("one wrong window", 0), ("wrong windows", 9)])
+def test_a_window_that_went_wrong_is_no_jump(kind: str, every_s: int) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        t, start, end = _windows(60, 60)
+        td = 0.006 + 1e-4 * rng.normal(size=60)
+        td[rng.integers(60) if not every_s else slice(3, None, every_s)] += 0.05
+        assert fit_clock(t, start, end, td, np.full(60, 1e-4)).kind == "constant"
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [lambda t: 40e-6 * t + 10e-6 / 3600 * t**2, lambda t: -0.03 * np.exp(-t / 600) + 10e-6 * t, lambda t: 1e-3 * np.sin(t / 287)],
+    ids=["bent", "warming up", "waving"],
+)
+def test_a_skew_that_changes_with_temperature_is_no_staircase(drift: Callable[[np.ndarray], np.ndarray]) -> None:
+    t, start, end = _windows(180, 3600)
+    for seed in range(3):
+        td = 0.006 + drift(t) + 1e-4 * np.random.default_rng(seed).normal(size=180)
+        clock = fit_clock(t, start, end, td, np.full(180, 1e-4))
+        assert clock.kind == "drifting"
+        assert _rms(list(clock.at(t) - 0.006 - drift(t))) < 1e-4
+        rates = np.gradient(drift(t), t)
+        assert clock.skew_range == pytest.approx((rates.min(), rates.max()), abs=6e-6)
+        assert "ppm, from " in describe(clock)[0]
+
+
+def test_many_drops_are_many_jumps() -> None:
+    clock = _clock(60, 60, 1e-4, 0, jumps=tuple((5.0 * k, -0.05) for k in range(1, 12)))
+    assert len(clock.jumps) == 11
+    said = describe(clock, 20.0)
+    assert len(said) == 5
+    assert said[0].endswith("ms at 5.0 s (1 frame period of 20 Hz: dropped frames or a driver's re-sync)")
+    assert said[-1] == "7 more jumps, of -50.0 to -49.9 ms, the last at 55.0 s"
+
+
+def test_few_windows_are_too_short_to_tell() -> None:
+    for w in (1, 2, 3):
+        t, start, end = _windows(w, 10)
+        clock = fit_clock(t, start, end, 0.03 * np.arange(w), np.full(w, 1e-4))
+        assert (clock.kind, clock.too_short, clock.jumps, clock.skew) == ("constant", True, (), 0)
+        assert describe(clock)[0].startswith("too short to tell whether the clocks drift or jump: ")
+    with pytest.raises(ValueError, match="needs windows"):
+        fit_clock(*np.zeros((5, 0)))
+
+
+def test_words() -> None:
+    (said,) = describe(_clock(60, 60, 5e-5, 0, skew=50e-6))
+    assert said == "the clock drifts: td changes by +49.9 +- 0.3 ppm (+2.99 ms over 60 s)"
+    drift, jump = describe(_clock(60, 60, 5e-5, 0, -50e-6, ((30.1, 0.05),)), 20.0)
+    assert drift.startswith("the clock drifts: td changes by -5")
+    assert (
+        jump == "the clock jumps: td changes by +50.01 +- 0.02 ms at 30.5 s (1 frame period of 20 Hz: dropped frames or a driver's re-sync)"
+    )
+    (other,) = describe(_clock(60, 60, 5e-5, 0, 0.0, ((30.1, 0.033),)), 20.0)
+    assert other.endswith("(dropped frames or a driver's re-sync)")
+    constant = _clock(60, 60, 5e-5, 0)
+    (said,) = describe(constant)
+    limit = constant.skew_limit * 1e6
+    assert said == f"the clocks keep step: no jump, and a drift is below {limit:.2g} ppm ({limit * 0.06:.2g} ms over 60 s)"
+    assert 0 < limit < 3
+    worse = _clock(360, 60, 5e-5, 0, scatter=lambda rng, w: 2 * rng.normal(size=w))
+    assert worse.scatter == pytest.approx(2, rel=0.15)
+    assert describe(worse)[-1] == f"td of the windows scatters {worse.scatter:.1f} times as much as their sigmas say"

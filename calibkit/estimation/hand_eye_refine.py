@@ -1,0 +1,215 @@
+"""Joint maximum likelihood of X, each world's Z and every true pose, with noise on both sides whose size the residuals tell.
+
+Unknown are X, Z_w and the true M_i = T_w2_2(i), with Q_i = M_i exp(q_i) and P_i = Z_w M_i X^-1 exp(p_i). In M's right tangent, to first order
+
+    e_i = local(Z_w M_i X^-1, P_i) - local(M_i, Q_i) = -x + Ad(M_i^-1) z_w + noise of covariance C_i = C_P,i + C_Q,i,
+
+the first local carried by Ad(X^-1); eliminating M_i leaves 6 equations a pose (Gauss-Helmert), and the Jacobians are those at the adjusted poses:
+at the measured ones the noise in them would count as knowledge of X.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.estimation.hand_eye_data import HandEyeData, Mask
+from calibkit.estimation.hand_eye_robust import Seed
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+
+WRONG = 27.86  # chi-squared of 6 degrees of freedom beyond which 1 good pose in 10 000 lies
+ASSUMED_SIGMAS = (1e-3, 1e-3)  # rad, m: where the poses are too few to tell
+_FAR = np.array([100.0] * 3 + [10.0] * 3) ** -2.0  # information before any: nothing is farther than 100 m and 10 rad
+_FINEST = 1e-18  # variance: rounding's share of perfect data
+_MAX_STEPS = 40
+_SETTLED = 1e-6  # sigmas squared
+_NOISE_SETTLED = 1e-3
+_MAX_REVERSALS = 5
+_ENOUGH_FOR_NOISE = 1000  # poses: sigmas to 1 %
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The optimum; what belongs to a pose is in M_i's right tangent."""
+
+    X: Array  # (4, 4)
+    Z: Array  # (n_worlds, 4, 4)
+    M: Array  # (n, 4, 4) adjusted T_w2_2
+    kept: Mask  # (n,)
+    chi2: Array  # (n,) of 6 degrees of freedom
+    e: Array  # (n, 6) residuals
+    C: Array  # (n, 6, 6) their covariance before the fit
+    C_P: Array  # (n, 6, 6) P's share of it
+    noise: dict[str, float]  # sigmas: P_rotation rad, P_translation m, or P_factor of cov_P's; likewise Q
+    noise_is_assumed: bool  # too few poses to tell
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations with the worlds eliminated: S is the information about X."""
+
+    S: Array  # (6, 6)
+    gradient: Array  # (6,)
+    A: Array  # (n_worlds, 6, 6) information about each Z given X
+    follow: Array  # (n_worlds, 6, 6) d z_w / d x
+    apart: Array  # (n_worlds, 6) z_w for x = 0
+    J_Z: Array  # (n, 6, 6) Ad(M^-1)
+    J_X: Array  # (n, 6, 6) d e_i / d x with z_w following
+    active: Mask  # (n,) whose world has two kept poses or more
+
+    def spread_parts(self, data: HandEyeData) -> tuple[Array, Array]:
+        """Return the covariance (n, 6, 6) of the fitted e_i, by z_w given x and by x."""
+        by_world = self.J_Z @ np.linalg.inv(self.A)[data.world] @ np.swapaxes(self.J_Z, 1, 2)
+        return by_world, self.J_X @ np.linalg.inv(self.S) @ np.swapaxes(self.J_X, 1, 2)
+
+    def spread(self, data: HandEyeData) -> Array:
+        """Return their sum."""
+        by_world, by_X = self.spread_parts(data)
+        out: Array = by_world + by_X
+        return out
+
+
+def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Normal:
+    """Return the normal equations of e = -x + Ad(M^-1) z.
+
+    A world with fewer than two kept poses says nothing of X; its Z is that of all its poses.
+    """
+    W, J_Z = np.linalg.inv(C), se3.adjoint(se3.inverse(M))
+    active = (np.bincount(data.world, kept, data.n_worlds) >= 2)[data.world]
+    JW = np.swapaxes(J_Z, 1, 2) @ W * (kept | ~active)[:, None, None]
+    A = _by_world(data, JW @ J_Z) + np.diag(_FAR)
+    right = _by_world(data, np.concatenate([JW, (JW @ e[:, :, None])], axis=2))
+    solved = np.linalg.solve(A, right)
+    follow, apart = solved[:, :, :6], solved[:, :, 6]
+    J_X = J_Z @ follow[data.world] - np.eye(6)
+    RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
+    left = e - (J_Z @ apart[data.world][:, :, None])[:, :, 0]
+    S = np.sum(RW @ J_X, axis=0) + np.diag(_FAR)
+    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, active)
+
+
+def _by_world(data: HandEyeData, values: Array) -> Array:
+    if data.n_worlds == 1:
+        return np.asarray(values.sum(axis=0, keepdims=True))
+    out = np.zeros((data.n_worlds, *values.shape[1:]))
+    np.add.at(out, data.world, values)
+    return out
+
+
+def refine(data: HandEyeData, start: Seed) -> Refined:
+    """Return the optimum from a seed: a step, the noise and the choice of poses in turn until none of them changes any more."""
+    X, Z, M, kept = start.X, start.Z, data.Q, start.kept
+    theta, floor = _first_noise(data, start)
+    system: Normal | None = None
+    e, kinds = _residuals(data, X, Z, M)
+    reversals, converged = 0, False
+    for _ in range(_MAX_STEPS):
+        told = _tells_noise(data, kept)
+        before = _mean_diagonal(kinds, theta)
+        if told and system is not None:
+            theta = np.maximum(_noise(data, kinds, theta, e, kept, system), floor)
+        noise_settled = bool(np.all(np.abs(_mean_diagonal(kinds, theta) / before - 1) < _NOISE_SETTLED))
+        C, C_P = _sum(kinds, theta), _sum(kinds[:, : _on_P(data)], theta[: _on_P(data)])
+        system = normal(data, M, C, e, kept)
+        x = np.linalg.solve(system.S, system.gradient)
+        z = system.apart + system.follow @ x
+        left = e + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0]
+        chi2 = _chi2(data, C, left, kept, system)
+        m = se3.local(M, data.Q) + ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
+        X, Z, M = se3.retract(X, x), se3.retract(Z, z), se3.retract(M, m)
+        e, kinds = _residuals(data, X, Z, M)
+        if noise_settled and float(x @ system.S @ x) < _SETTLED:
+            now = chi2 < WRONG
+            if np.array_equal(now, kept) or reversals == _MAX_REVERSALS:
+                converged = True
+                break
+            kept, reversals = now, reversals + 1
+    names = _names(data)
+    sigmas = dict(zip(names, np.sqrt(theta).tolist(), strict=True))
+    return Refined(
+        X, Z, M, kept, chi2, e, _sum(kinds, theta), _sum(kinds[:, : _on_P(data)], theta[: _on_P(data)]), sigmas, not told, converged
+    )
+
+
+def _residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, Array]:
+    """Return e (n, 6) and the covariances (n, k, 6, 6) of one unit of each kind of noise, P's first."""
+    P = Z[data.world] @ M @ se3.inverse(X)
+    on_P = se3.adjoint(se3.inverse(X))
+    e = se3.local(P, data.P) @ on_P.T - se3.local(M, data.Q)
+    world_P, world_Q = se3.adjoint(se3.inverse(Z[data.world] @ M)), se3.adjoint(se3.inverse(M))
+    sides = (
+        (data.cov_P, on_P, world_P if data.words.P_at_world else np.broadcast_to(on_P, world_P.shape)),
+        (data.cov_Q, np.eye(6), world_Q if data.words.Q_at_world else np.broadcast_to(np.eye(6), world_Q.shape)),
+    )
+    kinds = []
+    for cov, carried, isotropic in sides:
+        if cov is not None:
+            kinds.append(carried @ cov @ carried.T)
+        else:
+            kinds += [isotropic[:, :, part] @ np.swapaxes(isotropic[:, :, part], 1, 2) for part in (slice(3, 6), slice(0, 3))]
+    return e, np.stack(kinds, axis=1)
+
+
+def _names(data: HandEyeData) -> tuple[str, ...]:
+    """Return what each kind of noise is a sigma of."""
+    sides = (("P", data.cov_P), ("Q", data.cov_Q))
+    return tuple(f"{s}_{kind}" for s, cov in sides for kind in (("rotation", "translation") if cov is None else ("factor",)))
+
+
+def _on_P(data: HandEyeData) -> int:
+    return 2 if data.cov_P is None else 1
+
+
+def _first_noise(data: HandEyeData, start: Seed) -> tuple[Array, Array]:
+    """Return variances to start from, what the seed left over shared by both sides, and the least that they may be."""
+    told = _tells_noise(data, start.kept)
+    phi, rho = (start.sigma_phi, start.sigma_rho) if told else ASSUMED_SIGMAS
+    first, least = {"rotation": phi**2 / 2, "translation": rho**2 / 2, "factor": 1.0}, {"factor": 1e-12}
+    kinds = [name.split("_")[1] for name in _names(data)]
+    floor = np.array([least.get(kind, _FINEST) for kind in kinds])
+    return np.maximum([first[kind] for kind in kinds], floor), floor
+
+
+def _tells_noise(data: HandEyeData, kept: Mask) -> bool:
+    """Return whether residuals are left over: six more than X has unknowns."""
+    count = np.bincount(data.world, kept, data.n_worlds)
+    return bool(6 * np.sum(np.maximum(count - 1, 0)) >= 12)
+
+
+def _noise(data: HandEyeData, kinds: Array, theta: Array, e: Array, kept: Mask, system: Normal) -> Array:
+    """Return the variances after two steps of Horn's (1975) iterated almost unbiased estimator, restricted likelihood's: never negative.
+
+    theta_k <- theta_k (sum e^T C^-1 G_k C^-1 e) / (sum tr(Pi G_k)), Pi = C^-1 - C^-1 J cov J^T C^-1.
+    """
+    at = np.flatnonzero(system.active & kept)
+    at = at[:: max(1, len(at) // _ENOUGH_FOR_NOISE)]
+    kinds, e, spread = kinds[at], e[at], system.spread(data)[at]
+    for _ in range(2):
+        W = np.linalg.inv(_sum(kinds, theta))
+        We = W @ e[:, :, None]
+        found = np.einsum("nia,nkij,njb->k", We, kinds, We, optimize=True)
+        expected = np.einsum("nij,nkji->k", W - W @ spread @ W, kinds)
+        theta = theta * found / np.maximum(expected, 1e-300)
+    return theta
+
+
+def _chi2(data: HandEyeData, C: Array, left: Array, kept: Mask, system: Normal) -> Array:
+    """Return each pose's residual against its covariance, smaller than C where the pose took part in the fit and larger where it did not."""
+    by_world, by_X = system.spread_parts(data)
+    count = np.bincount(data.world, kept, data.n_worlds)[data.world]
+    in_world, in_X = kept | (count < 2), kept & (count >= 2)
+    V = C + np.where(in_world, -1, 1)[:, None, None] * by_world + np.where(in_X, -1, 1)[:, None, None] * by_X
+    # What the fit cannot miss has no residual but rounding.
+    out: Array = np.sum(left * np.linalg.solve(V + 1e-6 * C, left[:, :, None])[:, :, 0], axis=1)
+    return out
+
+
+def _sum(kinds: Array, theta: Array) -> Array:
+    out: Array = np.einsum("nkij,k->nij", kinds, theta)
+    return out
+
+
+def _mean_diagonal(kinds: Array, theta: Array) -> Array:
+    out: Array = np.einsum("nkii,k->i", kinds, theta)
+    return out

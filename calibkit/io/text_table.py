@@ -55,7 +55,7 @@ _NAMES = {
     "ny": ("ny", "axis_y"),
     "nz": ("nz", "axis_z"),
 }
-_CANONICAL = {name: key for key, names in _NAMES.items() for name in names}
+CANONICAL = {name: key for key, names in _NAMES.items() for name in names}
 # Units as headers write them, lower case; of none SI is meant, and a time's is guessed from its size.
 _TIME_UNITS = {"": 0, "ns": 1, "us": 10**3, "µs": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
 _LENGTH_UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -104,7 +104,7 @@ class TextTable:
             named = [] if odd else _SHAPES.get(self._width, [])
         for column, title in enumerate(named):
             title, _, unit = title.partition("[")
-            if key := _CANONICAL.get(title.strip(' "')):
+            if key := CANONICAL.get(title.strip(' "')):
                 self.columns[key], self.units[key] = column, unit.strip(' ]"')
 
     @cached_property
@@ -162,19 +162,15 @@ class TextTable:
         column = self.columns["t"]
         texts = [line.split(self._delimiter, column + 1)[column].strip() for line in lines]
         try:
-            unit = self._time_unit
-            if unit == 1 and all(map(str.isdecimal, texts)):  # the same, and faster
-                return np.array(list(map(int, texts)), np.int64)
-            return np.array([_whole(Decimal(text), unit) for text in texts], np.int64)
+            return times_ns(texts, self._time_unit)
         except (ArithmeticError, ValueError) as error:
             raise BadInputError(f"{self.name}: its time column must hold numbers of ns, us, ms or s ({one_line(error, 80)})") from error
 
     @cached_property
     def _time_unit(self) -> int:
-        """The time column's unit in ns: the header's, else what the first value's size means, else s."""
-        text = next(self._blocks())[0].split(self._delimiter)[self.columns["t"]].strip()
-        first = stamp_ns(text)
-        return int(self.scale("t")) or (round(first / Decimal(text)) if first else 10**9)
+        """The time column's unit in ns: the header's, else what the first value's size means."""
+        first = next(self._blocks())[0].split(self._delimiter)[self.columns["t"]].strip()
+        return int(self.scale("t")) or time_unit(first)
 
     def _find_data(self) -> tuple[list[str], str]:
         """Return the lines before the first row, and that row."""
@@ -232,6 +228,19 @@ class TextTable:
 
     def _too_large(self) -> BadInputError:
         return BadInputError(f"{self.name} is larger than {_MAX_FILE} bytes: split it, or record a bag")
+
+
+def time_unit(first: str) -> int:
+    """Return the unit in ns that the size of a stream's first time means (s, ms, us or ns since 1970), else s."""
+    t_ns = stamp_ns(first)
+    return round(t_ns / Decimal(first)) if t_ns else 10**9
+
+
+def times_ns(texts: list[str], unit: int) -> Times:
+    """Return times of a unit (in ns) in whole ns, exactly; ArithmeticError or ValueError where one is none."""
+    if unit == 1 and all(map(str.isdecimal, texts)):  # the same, and faster
+        return np.array(list(map(int, texts)), np.int64)
+    return np.array([_whole(Decimal(text), unit) for text in texts], np.int64)
 
 
 def _whole(value: Decimal, unit: int) -> int:

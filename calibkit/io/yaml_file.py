@@ -63,7 +63,7 @@ class Document:
 
 def load_yaml(path: Path, max_bytes: int = MAX_BYTES, opencv: bool = False) -> Document:
     """Read a file of one YAML document; `opencv` also tolerates the first line %YAML:1.0 and the tag !!opencv-matrix."""
-    content = _read(path, max_bytes)
+    content = read_capped(path, max_bytes, "the YAML file")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -75,10 +75,11 @@ def load_yaml(path: Path, max_bytes: int = MAX_BYTES, opencv: bool = False) -> D
     return Document(path, data, sha256(content).hexdigest(), lines)
 
 
-def _read(path: Path, max_bytes: int) -> bytes:
+def read_capped(path: Path, max_bytes: int, what: str) -> bytes:
+    """Return the content of a regular file of at most so many bytes; BadInputError where it is none ("give `what` itself")."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
-            raise BadInputError(f"{one_line(path)}: is not a file; give the YAML file itself")
+            raise BadInputError(f"{one_line(path)}: is not a file; give {what} itself")
         with path.open("rb") as file:
             content = file.read(max_bytes + 1)
     except (OSError, ValueError) as error:

@@ -68,7 +68,7 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
     if fit.gain < _ALIKE or fit.noise_share > _PRETENDED or fit.depth < _BOWL:
         if fast < _STILL or float(np.median(np.linalg.norm(known, axis=1))) < _STILL:
             return f"the rig hardly turns ({middle:.2g} rad/s in the middle): at rest every offset fits alike; {_MOTION}"
-        if fit.gain < _ALIKE and change > 0.3:
+        if change > 0.3 and (fit.gain < _ALIKE or fit.start.unlike > _UNLIKE):
             return (
                 f"{of} and {to} never turn alike at any offset: are both on one rigid body, do they overlap in time, is a topic wrong, "
                 "or are the poses those of the world seen from the sensor (--inverse-poses)?"

@@ -98,9 +98,10 @@ def time_offset(
     recording = open_recording(list(sources), options.ros_distro, options.reading)
     job = _Job(recording, base, options, progress)
     of, to = _pair(_sensors(recording, base, options), options)
-    seen_of, seen_to = _look(job, of), _look(job, to)
-    if seen_to.samples is None:
+    if to.kind == "image" and options.target is None:
         raise BadInputError(f"--to {to.name}: a camera without a board has turns between images only; swap --of and --to, or give --target")
+    seen_to, seen_of = _look(job, to), _look(job, of)  # in this order: an IMU is soon read, and what is wrong with it told
+    assert seen_to.samples is not None
     rotation = _rotation(base, of, to) if options.fix_rotation else None
     pair = Pair(of.name, to.name, one_line(of.topic), one_line(to.topic), seen_of.method, seen_of.focal_px)
     try:
@@ -119,11 +120,16 @@ def time_offset(
 
 
 def _sensors(recording: Recording, base: Rig, options: Options) -> list[Sensor]:
-    """Return the streams to choose from, named as the rig file has their topics, else cam0, imu0, pose0, odom0 in order."""
+    """Return the streams to choose from, named as the rig file has their topics, else cam0, imu0, pose0, odom0 in order.
+
+    Those asked for, or all; where one alone is asked for, those of other kinds too.
+    """
     topics = {topic.name: topic for topic in recording.topics}
     asked = [text.rpartition("=") if "=" in text and not text.startswith("tf:") else ("", "", text) for text in options.sensors]
-    if not asked:
-        asked = [("", "", topic.name) for topic in recording.topics if topic.kind in _PREFIX and topic.kind != "tf"]
+    if len(asked) < 2:  # the other one is found, if it is of another kind
+        there = {_PREFIX.get(topics[topic].kind) if topic in topics else _PREFIX["tf"] for _, _, topic in asked}
+        others = (topic for topic in recording.topics if topic.kind in _PREFIX and topic.kind != "tf")
+        asked += [("", "", topic.name) for topic in others if _PREFIX[topic.kind] not in there]
     known = {entry.topic: name for part in (base.cameras, base.imus) for name, entry in part.items() if entry.topic}
     found: list[Sensor] = []
     for name, _, topic in asked:
@@ -163,6 +169,10 @@ def _pair(sensors: list[Sensor], options: Options) -> tuple[Sensor, Sensor]:
         if len(named) + len(others) > 2:
             imus = [sensor for sensor in others if sensor.kind == "imu"]
             others = imus if named and len(imus) == 1 else others
+        if len(sensors) < 2:
+            raise BadInputError(
+                f"two sensors that turn are needed, the recording has {offered}: give the other one's file too, or --pose tf:PARENT/CHILD"
+            )
         if len(named) + len(others) != 2:
             raise BadInputError(
                 f"which two? the recording has {counted(len(sensors), 'sensor')} that turn: {offered}; name them: --of NAME --to NAME"

@@ -21,7 +21,7 @@ USES = {
     "twist": "timeoffset",
     "tf": "handeye, timeoffset (yet to come)",
     "camera_info": "the driver's own calibration, to compare with",
-    "corners": "intrinsics (with --target and --resolution)",
+    "corners": "intrinsics (with --target and --resolution), timeoffset (with --target)",
     "cloud": "nothing yet",
     "video": "nothing: video-coded images are not read; record sensor_msgs/CompressedImage (jpeg or png) instead",
     "other": "nothing",

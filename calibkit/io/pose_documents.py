@@ -8,16 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calibkit.errors import one_line
-from calibkit.io.pose_names import ABC, POSITIONS, QUATERNIONS, R9, ROTVEC, RPY, WPR, PoseRows, name_of
+from calibkit.io.pose_names import ABC, POSITIONS, QUATERNIONS, R9, ROTVEC, RPY, RXYZ, WPR, PoseRows, name_of
 from calibkit.io.text_table import XYZ, Q
 from calibkit.io.yaml_file import Document, load_yaml
 
 _MAX_BYTES = 16_000_000
 _POSE = re.compile(r".*pose|transform|t_\w+|tcp|flange")  # keys around a pose that say nothing of its parts
 _POSES = re.compile(r".*(poses|transforms|frames|views)")
-_ORDER = (*XYZ, *Q, *R9, *ABC, *WPR, *RPY, *ROTVEC)
+_ANGLES = (*ABC, *WPR, *RPY, *ROTVEC, *RXYZ)
+_ORDER = (*XYZ, *Q, *R9, *_ANGLES)
 _WHOLE = (6, 7, 8, 12, 16)  # numbers of a pose in one list
-_UNITS = {"unit": XYZ, "units": XYZ, "length_unit": XYZ, "pose_unit": XYZ, "angle_unit": (*ABC, *WPR, *RPY, *ROTVEC)}
+_UNITS = {"unit": XYZ, "units": XYZ, "length_unit": XYZ, "pose_unit": XYZ, "angle_unit": _ANGLES}
 _UNKNOWN = ("?",)  # the order, or the convention, is not said
 # What a list of so many numbers under such a key holds.
 _LISTS: dict[tuple[str, int], tuple[str, ...]] = {
@@ -116,8 +117,8 @@ def _entries(document: Document, side: int | None) -> list[_Entry]:
         else:
             inner = [key for key, value in data.items() if isinstance(value, dict) and _POSES.fullmatch(key.lower())]
             keys, data = ((inner[0],), data[inner[0]]) if len(inner) == 1 else ((), data)
-    elif not _is_list_of_poses(data):
-        data = [data]
+    elif not (_is_list_of_poses(data) or (isinstance(data, list) and any(isinstance(item, dict) for item in data))):
+        data = [data]  # one pose alone
     if isinstance(data, list):
         entries = [_Entry((*keys, i), None, value) for i, value in enumerate(data)]
     elif any(key.lower() in (*POSITIONS, "x") or _POSE.fullmatch(key.lower()) for key in data):

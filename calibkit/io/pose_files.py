@@ -19,7 +19,7 @@ from calibkit.io.pose_rows import read_rows
 from calibkit.io.text_table import time_unit, times_ns
 from calibkit.io.yaml_file import read_capped
 
-_MAX_BYTES = 32_000_000  # 160 000 poses
+_MAX_BYTES = 16_000_000  # 80 000 poses
 _DOCUMENTS = (".yaml", ".yml", ".json")
 _TIME_UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
 

@@ -9,7 +9,7 @@
 | rpy | x y z roll pitch yaw | m, rad | R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF |
 | kuka-abc | X Y Z A B C | mm, deg | R = Rz(A) Ry(B) Rx(C) |
 | fanuc-wpr | X Y Z W P R | mm, deg | R = Rz(R) Ry(P) Rx(W) |
-| ur-rotvec | x y z rx ry rz | m, rad | R = exp(r) |
+| ur-rotvec | x y z and a rotation vector v | m, rad | R = exp(v) |
 | abb-quat | x y z q1 q2 q3 q4 | mm | Hamilton quaternion, w first |
 
 Every pose is T_parent_child, its columns the child's axes in the parent's frame: a robot's flange or TCP in its base.

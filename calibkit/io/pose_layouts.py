@@ -6,11 +6,11 @@ import numpy as np
 
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.pose_formats import FORMATS, fault
-from calibkit.io.pose_names import ROTATIONS, ROTVEC, RPY, WPR, PoseRows
+from calibkit.io.pose_names import ROTATIONS, ROTVEC, RPY, RXYZ, WPR, PoseRows
 from calibkit.io.text_table import XYZ
 
 _COUNTERS = 1e8  # whole numbers below are counters and no times, as in folders of images
-_ALSO = {"rpy": RPY, "fanuc-wpr": WPR}  # what rx, ry, rz are called elsewhere: angles about x, y and z
+_ALSO = {"ur-rotvec": ROTVEC, "rpy": RPY, "fanuc-wpr": WPR}  # what rx, ry, rz can be: a vector, or angles about x, y and z
 Named = tuple[PoseRows, str, tuple[str, ...]]  # rows with named columns, the format, notes
 
 
@@ -47,14 +47,14 @@ def _by_name(rows: PoseRows, fmt: str | None) -> Named:
     if len(turns) != 1 or not held >= set(XYZ):
         names = one_line(" ".join(rows.columns or ()), 120)
         raise BadInputError(f"{path}: the columns named are {names}: wanted are x y z and one whole rotation, such as qx qy qz qw")
-    if turns[0] == ROTVEC and fmt is None:
-        raise _ask(path, "columns rx, ry, rz fit", ["ur-rotvec", "rpy", "fanuc-wpr"])
-    if turns[0] == ROTVEC and fmt in _ALSO:
-        other = dict(zip(ROTVEC, _ALSO[fmt], strict=True))
+    if turns[0] == RXYZ and fmt is None:
+        raise _ask(path, "columns rx, ry, rz fit", list(_ALSO))
+    if turns[0] == RXYZ and fmt in _ALSO:
+        other = dict(zip(RXYZ, _ALSO[fmt], strict=True))
         columns = tuple(other.get(name, name) for name in rows.columns or ())
         rows = replace(rows, columns=columns, units={other.get(name, name): unit for name, unit in rows.units.items()})
         turns = [_ALSO[fmt]]
-    fitting = [name for name, form in FORMATS.items() if set(form.layouts[0]) >= set(turns[0])]
+    fitting = [name for name, form in FORMATS.items() if set(form.layouts[0]) >= set(turns[0])] or list(_ALSO)
     if fmt is not None and fmt not in fitting:
         raise BadInputError(f"{path}: its columns are named {' '.join(turns[0])}, which are {' or '.join(fitting)} and not {fmt}")
     if fmt == "tum" and rows.stamps is None:
@@ -63,19 +63,21 @@ def _by_name(rows: PoseRows, fmt: str | None) -> Named:
 
 
 def _by_count(rows: PoseRows, fmt: str | None) -> Named:
+    """Return rows with the columns of the only format that they fit."""
     width, lead, path = rows.numbers.shape[1], _lead(rows), one_line(rows.path)
     exact: list[tuple[str, PoseRows]] = []
     led: list[tuple[str, PoseRows]] = []  # where the first column is not the pose's
     for name, form in FORMATS.items():
         for layout in form.layouts if fmt in (None, name) else ():
-            if len(layout) == width and not (name == "tum" and lead == "counter" and fmt is None):
+            if len(layout) == width:
                 exact.append((name, _with_columns(rows, layout)))
             elif len(layout) + 1 == width and lead is not None and name != "tum":
                 led.append((name, _with_columns(without_lead(rows), layout)))
     if not exact + led:
         raise _wrong_count(path, width, fmt)
     good = [(name, named) for name, named in exact if fault(named) is None]
-    good = good or [(name, named) for name, named in led if fault(named) is None]
+    if not good or lead == "counter":  # 1, 2, 3 in front can be times or numbers of images, times are times
+        good += [(name, named) for name, named in led if fault(named) is None]
     if not good:
         found = [(named, fault(named) or (0, "")) for _, named in exact + led]
         named, first = max(found, key=lambda item: item[1][0])  # that which fits most rows

@@ -13,30 +13,35 @@ from calibkit.io.text_table import CANONICAL, XYZ, Q
 
 Array = NDArray[np.float64]
 R9 = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))  # by rows
-ABC, WPR, RPY, ROTVEC = ("a", "b", "c"), ("w", "p", "r"), ("roll", "pitch", "yaw"), ("rx", "ry", "rz")
-ROTATIONS = (Q, R9, ABC, WPR, RPY, ROTVEC)
+ABC, WPR, RPY, ROTVEC = ("a", "b", "c"), ("w", "p", "r"), ("roll", "pitch", "yaw"), ("rotvec_x", "rotvec_y", "rotvec_z")
+RXYZ = ("rx", "ry", "rz")  # a rotation vector with some, angles with others
+ROTATIONS = (Q, R9, ABC, WPR, RPY, ROTVEC, RXYZ)
 LABELS = ("image", "img", "image_name", "image_file", "image_path", "file", "filename", "file_name", "name", "id", "index", "frame")
 POSITIONS = ("position", "translation", "pos", "trans", "xyz", "p", "t")
 QUATERNIONS = ("quaternion", "quat", "q", "orientation", "rotation")
 _NAMES = {
     **{name: key for name, key in CANONICAL.items() if key in ("t", *XYZ, *Q)},
     **{f"{word}_{axis}": axis for word in POSITIONS for axis in XYZ},
-    **{f"{word}_{axis}": f"q{axis}" for word in QUATERNIONS for axis in "xyzw"},
-    **{f"{word}{name}": name for word in ("", "orientation_", "rotation_", "rpy_") for names in (ABC, WPR, RPY, ROTVEC) for name in names},
-    **{f"{word}_{axis}": f"r{axis}" for word in ("rotvec", "rvec") for axis in XYZ},
+    **{f"{word}{name}": name for word in ("", "orientation_", "rotation_", "rpy_") for names in (ABC, WPR, RPY, RXYZ) for name in names},
+    **{f"{word}_{axis}": f"q{axis}" for word in QUATERNIONS for axis in "xyzw"},  # after WPR: rotation_w is a quaternion's
+    **{f"{word}_{axis}": f"rotvec_{axis}" for word in ("rotvec", "rvec") for axis in XYZ},
     **{name: name for name in R9},
     **dict.fromkeys(LABELS, "label"),
 }
 _AROUND = re.compile(r"^(pose_|transform_)+")
 _UNIT = re.compile(r"(?P<name>.*?)(\s*[\[(](?P<bracket>.*)[\])]|_(?P<suffix>mm|cm|m|deg|rad|ns|us|ms|s|sec))?")
+_MAX_TITLE = 100  # characters
 _LARGEST = 1e12  # of any number in a pose
 
 
 def name_of(title: str) -> tuple[str | None, str]:
     """Return the canonical name of a header's title or a key (t, x, qx, a, rx, r11, label, ...; None: unknown), and its unit or ""."""
-    plain = re.sub(r"[./\s]+", "_", title.strip(" \"'").lower()) if not re.search(r"[\[(]", title) else title.strip(" \"'").lower()
+    plain = title.strip(" \"'").lower()[:_MAX_TITLE]
+    if not re.search(r"[\[(]", plain):  # m/s is a unit, position.x a name
+        plain = re.sub(r"[./\s]+", "_", plain)
     parts = _UNIT.fullmatch(plain)
-    assert parts  # every text matches
+    if parts is None:  # a line break in a key
+        return None, ""
     for name, unit in ((plain, ""), (parts["name"], parts["bracket"] or parts["suffix"] or "")):
         if known := _NAMES.get(_AROUND.sub("", name.strip())):
             return known, unit.strip()

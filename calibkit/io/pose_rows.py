@@ -14,7 +14,9 @@ from calibkit.io.text_table import XYZ
 _COMMENT = re.compile(r"\s*(#|%|//)+")
 _BRACKETS = re.compile(r"\bp?\[|\[|\]")  # numpy's, and p[...] of UR's scripts
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_MAX_COLUMNS = 200
+_MAX_LINE = 8192  # characters
+_MAX_ROWS = 500_000
+_COLUMNS = (4, 200)  # at least, at most
 
 
 class _Line(NamedTuple):
@@ -46,7 +48,7 @@ def read_rows(path: Path, text: str, with_header: bool = True) -> PoseRows:
         return _named(path, table.rows, columns)
     first = [number(value) is None for value in table.rows[0].fields]
     if sum(first[1:-1]) or sum(first) > 1:
-        raise _error(path, table.rows[0].number, f"'{_odd(table.rows[0].fields)}' is not a number: only an image's name may stand there")
+        raise _error(path, table.rows[0].number, f"{_odd(table.rows[0].fields[1:])}: only an image's name may stand there")
     start, end = int(first[0]), len(first) - int(first[-1])
     values = _numbers(path, table.rows, range(start, end))
     labels = tuple(row.fields[0 if start else -1] for row in table.rows) if any(first) else None
@@ -61,12 +63,16 @@ def _error(path: Path, place: int | str, text: str) -> BadInputError:
 
 
 def _odd(fields: Sequence[str]) -> str:
-    return one_line(next(value for value in fields if number(value) is None), 40)
+    """Return what is wrong with the first field that is no number."""
+    odd = next(value for value in fields if number(value) is None)
+    return f"'{one_line(odd, 40)}' is not a number" if odd else "a field is empty"
 
 
 def _table(path: Path, text: str) -> _Table:
     table = _Table([], [], {})
     for line, content in enumerate(text.splitlines(), 1):
+        if len(content) > _MAX_LINE or len(table.rows) >= _MAX_ROWS:
+            raise _error(path, line, f"more than {_MAX_LINE} characters in a line, or {_MAX_ROWS} rows: this cannot be the right file")
         comment = _COMMENT.match(content)
         if comment or not content.strip():
             if comment and not table.rows:
@@ -85,10 +91,10 @@ def _table(path: Path, text: str) -> _Table:
             continue
         table.rows.append(_Line(line, fields))
         width = len(table.rows[0].fields)
-        if len(fields) != width or width > _MAX_COLUMNS:
-            raise _error(
-                path, line, f"has {len(fields)} columns, and the first row {width}: every row must have the same, {_MAX_COLUMNS} at most"
-            )
+        if not _COLUMNS[0] <= width <= _COLUMNS[1]:
+            raise _error(path, line, f"{width} columns are no pose: remove this line, or give one pose a row or in 4 rows")
+        if len(fields) != width:
+            raise _error(path, line, f"has {len(fields)} columns, and the first row {width}: every row must have the same")
     if not table.rows:
         raise BadInputError(f"{one_line(path)}: holds no poses; give rows of numbers, or a YAML or JSON list")
     return table
@@ -114,8 +120,8 @@ def _between_blanks(part: str) -> list[str]:
 
 
 def _titles(content: str) -> list[str]:
-    content = re.sub(r"\s+(?=[\[(])", "", content.strip())  # x [mm]
-    return re.split(r"\s*[,;]\s*", content) if re.search("[,;]", content) else content.split()
+    content = re.sub(r" (?=[\[(])", "", " ".join(content.split()))  # x [mm]
+    return re.split(" ?[,;] ?", content) if re.search("[,;]", content) else content.split()
 
 
 def _header(path: Path, table: _Table) -> list[tuple[str | None, str]] | None:
@@ -142,7 +148,7 @@ def _named(path: Path, rows: list[_Line], columns: list[tuple[str | None, str]])
     def texts(name: str) -> tuple[str, ...] | None:
         return tuple(row.fields[at[name]] for row in rows) if name in at else None
 
-    names = tuple(name for name in at if name not in ("t", "label"))
+    names = tuple(sorted(at.keys() - {"t", "label"}, key=lambda name: at[name]))
     values = _numbers(path, rows, [at[name] for name in names])
     places, stamps = tuple(f"line {row.number}" for row in rows), texts("t")
     units = {name: columns[i][1] for name, i in at.items()}
@@ -155,8 +161,7 @@ def _numbers(path: Path, rows: list[_Line], columns: Sequence[int]) -> Array:
             for column in columns:
                 value = number(row.fields[column])
                 if value is None:
-                    what = f"'{one_line(row.fields[column], 40)}' is not a number" if row.fields[column] else "a field is empty"
-                    raise _error(path, row.number, f"{what}: write it like 0.05, or leave this pose out")
+                    raise _error(path, row.number, f"{_odd([row.fields[column]])}: write it like 0.05, or leave this pose out")
                 yield value
 
     return np.fromiter(values(), np.float64).reshape(len(rows), len(columns))

@@ -21,6 +21,7 @@ _REACH = 2.5  # samples to either side that the regression takes in
 _LEAST_REACH_S = 0.012
 _STEP_S = (0.0025, 0.01)  # of the grid
 _CHUNK = 65536
+_MOST_POINTS = 40_000_000  # of the grid, 90 bytes each
 _HELD = 3.5  # median intervals; the rate across a longer gap in a gyroscope's stream is not known
 
 
@@ -120,6 +121,8 @@ def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64], sigma:
     interval = float(np.median(np.diff(t)))
     reach = max(_REACH * interval, _LEAST_REACH_S)
     step = float(np.clip(interval, *_STEP_S))
+    if t[-1] > _MOST_POINTS * step:
+        raise BadInputError(f"its {len(t)} stamps span {t[-1] / 3600:.0f} h: cut it, or correct stamps that are far from the others")
     grid: Array = np.arange(int(t[-1] / step) + 1, dtype=float) * step
     parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval) for i in range(0, len(grid), _CHUNK)]
     fitted, rate, chain, weights = (np.concatenate(each) for each in zip(*parts, strict=True))

@@ -110,9 +110,9 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
     start, reach = starts[0], settings.reach_s
     a = settle(_begin(turns, track, start, settings, reach), settings.levels, progress)
-    bias = _bias(a)
+    bias, taken_out = _bias(a), np.zeros(3)
     if isinstance(reference, ImuSamples) and np.linalg.norm(bias) > _BIAS:
-        a = newton(replace(a, track=track_of_gyro(reference, bias)))
+        a, taken_out = newton(replace(a, track=track_of_gyro(reference, bias))), bias
     a, windows = _with_clock(a, settings, reach)
     while True:
         tau: Array = settings.step_s * np.arange(-round(reach / settings.step_s), round(reach / settings.step_s) + 1, dtype=float)
@@ -140,7 +140,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         second=None,
         windows=windows,
         clock=a.clock,
-        gyro_bias=_bias(a),
+        gyro_bias=taken_out + _bias(a),
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
         gain=turned_alike(a, parts) / _inflation(covariance),
         noise_share=min(pretended, 1.0),

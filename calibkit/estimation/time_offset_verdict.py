@@ -152,6 +152,8 @@ def about_stamps(sensor: str, report: StampReport) -> list[str]:
     said = []
     if report.duplicates:
         said.append(f"{counted(report.duplicates, 'stamp repeats', 'stamps repeat')} another one; of each the first frame counts")
+    if report.zeros:
+        said.append(f"{counted(report.zeros, 'stamp is', 'stamps are')} zero, not set; those frames were left out")
     if report.missing_share > _MISSING:
         share = f"{100 * report.missing_share:.0f} % of the frames are missing ({report.missing} of {report.expected})"
         said.append(share if report.rate_hz is None else f"{share}, the rate is {report.rate_hz:.4g} Hz")

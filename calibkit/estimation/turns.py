@@ -13,6 +13,7 @@ Index = NDArray[np.intp]
 
 _LONGEST_NS = 1_000_000_000  # between two stamps; what happened in a longer pause is anyone's guess
 _GAP = 1.75  # median intervals
+_FAR_NS = 86_400e9  # from the middle one; a stamp further off is not set, or of another clock
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class Turns:
 
 
 def in_order(t_ns: Times) -> Index:
-    """Return the rows in the order of time, of equal stamps the first one only."""
+    """Return the rows in the order of time, of equal stamps the first one only; without stamps more than a day off the middle one."""
     order = np.argsort(t_ns, kind="stable")
+    order = order[np.abs(t_ns[order].astype(float) - np.median(t_ns)) <= _FAR_NS] if len(order) else order
     return order[np.concatenate([[True], np.diff(t_ns[order]) > 0])] if len(order) else order
 
 

@@ -8,22 +8,29 @@ the first local carried by Ad(X^-1); eliminating M_i leaves 6 equations a pose (
 at the measured ones the noise in them would count as knowledge of X.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from calibkit.estimation.hand_eye_data import HandEyeData, Mask
 from calibkit.estimation.hand_eye_robust import Seed
-from calibkit.geometry import se3
+from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
+from calibkit.solver import trust
 
-WRONG = 27.86  # chi-squared of 6 degrees of freedom beyond which 1 good pose in 10 000 lies
+_WRONG = 1e-4  # of the good poses lie beyond the limit
 ASSUMED_SIGMAS = (1e-3, 1e-3)  # rad, m: where the poses are too few to tell
 _FAR = np.array([100.0] * 3 + [10.0] * 3) ** -2.0  # information before any: nothing is farther than 100 m and 10 rad
-_FINEST = 1e-18  # variance: rounding's share of perfect data
+_NOTHING = 1e-8  # information in 1 mm and 1 mrad: of what is known to 10 m and 10 rad
+SCALES = np.array([trust.SCALES["m"]] * 3 + [trust.SCALES["rad"]] * 3)  # what X must be known to
+_FEWEST = 3  # poses whose residuals tell of noise
+_FINEST = 1e-14  # variance: nothing is known to better than 0.1 urad and 0.1 um
+_ROUNDING = 1e-13
 _MAX_STEPS = 40
+_STILL = 2  # steps without X: what the measured poses' noise tells is not yet told from knowledge
 _SETTLED = 1e-6  # sigmas squared
-_NOISE_SETTLED = 1e-3
+_NOISE_SETTLED = 5e-3
 _MAX_REVERSALS = 5
 _ENOUGH_FOR_NOISE = 1000  # poses: sigmas to 1 %
 
@@ -41,7 +48,7 @@ class Refined:
     C: Array  # (n, 6, 6) their covariance before the fit
     C_P: Array  # (n, 6, 6) P's share of it
     noise: dict[str, float]  # sigmas: P_rotation rad, P_translation m, or P_factor of cov_P's; likewise Q
-    noise_is_assumed: bool  # too few poses to tell
+    freedom: int  # residuals left over that told the noise; 0: it is assumed
     converged: bool
 
 
@@ -57,17 +64,35 @@ class Normal:
     J_Z: Array  # (n, 6, 6) Ad(M^-1)
     J_X: Array  # (n, 6, 6) d e_i / d x with z_w following
     active: Mask  # (n,) whose world has two kept poses or more
+    free: Array  # (6, k) directions of x that the poses tell of, orthonormal in SCALES; the others stay as they are
+
+    @property
+    def cov(self) -> Array:
+        """The covariance of x along what is free."""
+        out: Array = self.free @ np.linalg.inv(self.free.T @ self.S @ self.free) @ self.free.T
+        return out
+
+    @property
+    def held(self) -> Array:
+        """The other directions (6, 6 - k)."""
+        out: Array = SCALES[:, None] * np.linalg.svd(self.free / SCALES[:, None])[0][:, self.free.shape[1] :]
+        return out
 
     def spread_parts(self, data: HandEyeData) -> tuple[Array, Array]:
         """Return the covariance (n, 6, 6) of the fitted e_i, by z_w given x and by x."""
         by_world = self.J_Z @ np.linalg.inv(self.A)[data.world] @ np.swapaxes(self.J_Z, 1, 2)
-        return by_world, self.J_X @ np.linalg.inv(self.S) @ np.swapaxes(self.J_X, 1, 2)
+        return by_world, self.J_X @ self.cov @ np.swapaxes(self.J_X, 1, 2)
 
     def spread(self, data: HandEyeData) -> Array:
         """Return their sum."""
         by_world, by_X = self.spread_parts(data)
         out: Array = by_world + by_X
         return out
+
+
+def wrong_beyond(freedom: int) -> float:
+    """Return the limit of chi2 where the noise is told by as many residuals (Fisher's F)."""
+    return 6 * float(special.fdtri(6, freedom, 1 - _WRONG))
 
 
 def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Normal:
@@ -86,7 +111,34 @@ def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Norma
     RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
     left = e - (J_Z @ apart[data.world][:, :, None])[:, :, 0]
     S = np.sum(RW @ J_X, axis=0) + np.diag(_FAR)
-    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, active)
+    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, active, np.zeros((6, 0)))
+
+
+def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal, chance: bool = True) -> tuple[Array, Normal]:
+    """Return X's covariance (6, 6) by the information that is not made by the noise in the adjusted poses, and the system with what is free.
+
+    A pose's error d ~ D moves Ad(M) to Ad(M) (I + ad(d)): poses at rest would have sum E[ad(d)^T C^-1 ad(d)] of information. What is more
+    than that, and than chance can add (Davidson and Szarek 2001, as in hand_eye_pairs.Spectrum.rank), is knowledge.
+    """
+    used = np.flatnonzero(kept & system.active)
+    worlds = len(np.unique(data.world[used]))
+    some = used[:: max(1, len(used) // _ENOUGH_FOR_NOISE)]
+    W = np.linalg.inv(C[some])
+    D = C_P[some] @ W @ (C - C_P)[some]
+    values, vectors = np.linalg.eigh((D + np.swapaxes(D, 1, 2)) / 2)
+    roots = np.swapaxes(vectors * np.sqrt(np.maximum(values, 0))[:, None, :], 1, 2)
+    ad = np.zeros((*roots.shape, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = so3.hat(roots[..., 3:])
+    ad[..., :3, 3:] = so3.hat(roots[..., :3])
+    noise = np.einsum("nkai,nab,nkbj->ij", ad, W, ad, optimize=True) * len(used) / max(len(some), 1)
+    units = SCALES[:, None] * SCALES
+    if chance:
+        noise = noise * (1 + (np.sqrt(2) + 3) / np.sqrt(max(len(used) - worlds, 1))) ** 2
+    values, vectors = np.linalg.eigh((system.S - noise) * units)
+    whole = np.einsum("ij,ik,kj->j", vectors, system.S * units, vectors)
+    empty = values < np.maximum(whole / 2, max(_NOTHING, _ROUNDING * values[-1]))
+    back = vectors * SCALES[:, None]
+    return back / np.where(empty, _NOTHING, values) @ back.T, replace(system, free=vectors[:, ~empty] * SCALES[:, None])
 
 
 def _by_world(data: HandEyeData, values: Array) -> Array:
@@ -100,27 +152,29 @@ def _by_world(data: HandEyeData, values: Array) -> Array:
 def refine(data: HandEyeData, start: Seed) -> Refined:
     """Return the optimum from a seed: a step, the noise and the choice of poses in turn until none of them changes any more."""
     X, Z, M, kept = start.X, start.Z, data.Q, start.kept
-    theta, floor = _first_noise(data, start)
-    system: Normal | None = None
     e, kinds = _residuals(data, X, Z, M)
+    theta, least, most = _first_noise(data, e[kept])
+    system: Normal | None = None
     reversals, converged = 0, False
-    for _ in range(_MAX_STEPS):
-        told = _tells_noise(data, kept)
+    for number in range(_MAX_STEPS):
+        freedom = _freedom(data, kept)
         before = _mean_diagonal(kinds, theta)
-        if told and system is not None:
-            theta = np.maximum(_noise(data, kinds, theta, e, kept, system), floor)
+        if freedom and system is not None:
+            theta = np.clip(_noise(data, kinds, theta, e, kept, system), least, most)
         noise_settled = bool(np.all(np.abs(_mean_diagonal(kinds, theta) / before - 1) < _NOISE_SETTLED))
         C, C_P = _sum(kinds, theta), _sum(kinds[:, : _on_P(data)], theta[: _on_P(data)])
         system = normal(data, M, C, e, kept)
-        x = np.linalg.solve(system.S, system.gradient)
+        if number >= _STILL:
+            system = believed(data, C, C_P, kept, system, chance=False)[1]
+        x = system.cov @ system.gradient
         z = system.apart + system.follow @ x
         left = e + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0]
         chi2 = _chi2(data, C, left, kept, system)
         m = se3.local(M, data.Q) + ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
         X, Z, M = se3.retract(X, x), se3.retract(Z, z), se3.retract(M, m)
         e, kinds = _residuals(data, X, Z, M)
-        if noise_settled and float(x @ system.S @ x) < _SETTLED:
-            now = chi2 < WRONG
+        if number >= _STILL and noise_settled and float(x @ system.S @ x) < _SETTLED:
+            now = chi2 < wrong_beyond(freedom) if freedom else kept
             if np.array_equal(now, kept) or reversals == _MAX_REVERSALS:
                 converged = True
                 break
@@ -128,7 +182,7 @@ def refine(data: HandEyeData, start: Seed) -> Refined:
     names = _names(data)
     sigmas = dict(zip(names, np.sqrt(theta).tolist(), strict=True))
     return Refined(
-        X, Z, M, kept, chi2, e, _sum(kinds, theta), _sum(kinds[:, : _on_P(data)], theta[: _on_P(data)]), sigmas, not told, converged
+        X, Z, M, kept, chi2, e, _sum(kinds, theta), _sum(kinds[:, : _on_P(data)], theta[: _on_P(data)]), sigmas, freedom, converged
     )
 
 
@@ -161,20 +215,22 @@ def _on_P(data: HandEyeData) -> int:
     return 2 if data.cov_P is None else 1
 
 
-def _first_noise(data: HandEyeData, start: Seed) -> tuple[Array, Array]:
-    """Return variances to start from, what the seed left over shared by both sides, and the least that they may be."""
-    told = _tells_noise(data, start.kept)
-    phi, rho = (start.sigma_phi, start.sigma_rho) if told else ASSUMED_SIGMAS
-    first, least = {"rotation": phi**2 / 2, "translation": rho**2 / 2, "factor": 1.0}, {"factor": 1e-12}
-    kinds = [name.split("_")[1] for name in _names(data)]
-    floor = np.array([least.get(kind, _FINEST) for kind in kinds])
-    return np.maximum([first[kind] for kind in kinds], floor), floor
+def _first_noise(data: HandEyeData, e: Array) -> tuple[Array, Array, Array]:
+    """Return variances to start from, what the seed left over shared by both sides, and the least and the most that they may be."""
+    rho, phi = np.mean(e**2, axis=0).reshape(2, 3).mean(axis=1) if len(e) else (0.0, 0.0)
+    if len(e) < _FEWEST:
+        rho, phi = ASSUMED_SIGMAS[1] ** 2, ASSUMED_SIGMAS[0] ** 2
+    bounds = {"rotation": (phi / 2, _FINEST, 9 * phi), "translation": (rho / 2, _FINEST, 9 * rho), "factor": (1.0, 1e-12, 1e12)}
+    first, least, most = np.array([bounds[name.split("_")[1]] for name in _names(data)]).T
+    most = np.maximum(most, least)
+    return np.clip(first, least, most), least, most
 
 
-def _tells_noise(data: HandEyeData, kept: Mask) -> bool:
-    """Return whether residuals are left over: six more than X has unknowns."""
+def _freedom(data: HandEyeData, kept: Mask) -> int:
+    """Return how many residuals are left over to tell the noise by: none from less than two motions."""
     count = np.bincount(data.world, kept, data.n_worlds)
-    return bool(6 * np.sum(np.maximum(count - 1, 0)) >= 12)
+    motions = int(np.sum(np.maximum(count - 1, 0)))
+    return 6 * (motions - 1) if motions > 1 else 0
 
 
 def _noise(data: HandEyeData, kinds: Array, theta: Array, e: Array, kept: Mask, system: Normal) -> Array:
@@ -189,8 +245,9 @@ def _noise(data: HandEyeData, kinds: Array, theta: Array, e: Array, kept: Mask, 
         W = np.linalg.inv(_sum(kinds, theta))
         We = W @ e[:, :, None]
         found = np.einsum("nia,nkij,njb->k", We, kinds, We, optimize=True)
+        whole = np.einsum("nij,nkji->k", W, kinds)
         expected = np.einsum("nij,nkji->k", W - W @ spread @ W, kinds)
-        theta = theta * found / np.maximum(expected, 1e-300)
+        theta = theta * found / np.maximum(expected, 1e-6 * whole) + 1e-3 * _FINEST
     return theta
 
 

@@ -8,15 +8,14 @@ import numpy as np
 from calibkit.estimation.hand_eye_data import HandEyeData, Index, Mask
 from calibkit.estimation.hand_eye_few_axes import SEEDS, no_axis, one_axis
 from calibkit.estimation.hand_eye_methods import park
-from calibkit.estimation.hand_eye_pairs import choose_pairs, motions, spectrum
+from calibkit.estimation.hand_eye_pairs import motions, spectrum
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 
 _DRAWS = 150  # of four poses: of 30 % wrong ones 36 draws have none
 _SCORED = 300  # motions
 _GOOD = 0.4  # of the motions are taken for right: what is left of them where 37 % of the poses are wrong
-_EVERY_PAIR = 100  # poses: up to as many, all pairs
-_PAIRS = 2000
+_POSES = 60
 _ROUNDS = 3
 _OUTSIDE = 4.5  # sigmas; chance leaves out 1 in 6000
 _MEDIAN_3 = 1.538  # sigmas: the median length of a 3-vector of unit sigmas
@@ -46,12 +45,13 @@ def seed(data: HandEyeData, rng: np.random.Generator) -> Seed:
     kept, _, _ = inliers(data, best)
     rank = 0
     for _ in range(_ROUNDS):
-        pairs = pairs_of(data, kept)
+        pairs = pairs_of(data, kept, rng)
         if len(pairs) == 0:
             break
         A, B = motions(data.P, pairs), motions(data.Q, pairs)
         _, sigma_phi, _ = inliers(data, best)
-        rank = int(spectrum(A).rank(np.sqrt(2) * sigma_phi))
+        # Pairs share poses: chance adds what it adds to as many motions as there are poses.
+        rank = int(spectrum(A).rank(np.sqrt(2) * sigma_phi * (1 + (np.sqrt(2) + 3) / np.sqrt(len(np.unique(pairs))))))
         trial = SEEDS[rank](A, B, None)
         again, _, _ = inliers(data, trial)
         if again.sum() < 0.9 * kept.sum():
@@ -61,15 +61,19 @@ def seed(data: HandEyeData, rng: np.random.Generator) -> Seed:
     return Seed(best, worlds(data, best, kept), kept, rank, sigma_phi, sigma_rho)
 
 
-def pairs_of(data: HandEyeData, kept: Mask) -> Index:
-    """Return pairs (k, 2) of kept poses of one world: all up to 100 poses, the most telling ones of more."""
+def pairs_of(data: HandEyeData, kept: Mask, rng: np.random.Generator) -> Index:
+    """Return pairs (k, 2) of kept poses of one world: all of up to 60 poses."""
     if data.n_worlds == 1:
         at = np.flatnonzero(kept)
-        if len(at) <= _EVERY_PAIR:
-            return at[np.array(list(combinations(range(len(at)), 2)), np.intp).reshape(-1, 2)]
-        return at[choose_pairs(data.P[at], _PAIRS // 4)]
-    pairs = _within(data.slots)
+        at = np.sort(rng.permutation(at)[:_POSES])
+        return at[all_pairs(len(at))]
+    pairs = pairs_within(data.slots)
     return pairs[kept[pairs].all(axis=1)]
+
+
+def all_pairs(n: int) -> Index:
+    """Return the pairs (k, 2) of n poses."""
+    return np.array(list(combinations(range(n), 2)), np.intp).reshape(-1, 2)
 
 
 def worlds(data: HandEyeData, X: Array, kept: Mask) -> Array:
@@ -101,24 +105,24 @@ def _draws(data: HandEyeData, rng: np.random.Generator) -> Index:
         size = min(4, n)
         quads = np.argsort(rng.random((_DRAWS, min(n, 400))), axis=1)[:, :size]
         quads = np.sort(rng.permutation(n)[:400])[quads] if n > 400 else quads
-        return quads[:, np.array(list(combinations(range(size), 2)))]
-    pairs = _within(data.slots)
+        return quads[:, all_pairs(size)]
+    pairs = pairs_within(data.slots)
     return pairs[rng.integers(0, len(pairs), (_DRAWS, min(3, len(pairs))))]
 
 
 def _scored(data: HandEyeData, rng: np.random.Generator) -> Index:
     """Return pairs (k, 2) by chance: those that turn most are the wrong poses' own."""
     if data.n_worlds > 1:
-        pairs = _within(data.slots)
+        pairs = pairs_within(data.slots)
         return pairs[rng.permutation(len(pairs))[:_SCORED]]
     n = len(data.P)
     if n * (n - 1) // 2 <= _SCORED:
-        return np.array(list(combinations(range(n), 2)), np.intp)
+        return all_pairs(n)
     i = rng.integers(0, n, _SCORED)
     return np.stack([i, (i + rng.integers(1, n, _SCORED)) % n], axis=1)
 
 
-def _within(slots: Index) -> Index:
+def pairs_within(slots: Index) -> Index:
     """Return pairs (k, 2) of poses of one world half and a quarter of its length apart."""
     most = slots.shape[1]
     out = []

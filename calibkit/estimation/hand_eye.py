@@ -1,0 +1,236 @@
+"""Hand-eye: X of P X = Z Q from two sides' poses, robust, with covariance, what the poses leave open, and every closed form beside it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibkit.data.verdict import Status
+from calibkit.errors import BadInputError
+from calibkit.estimation.hand_eye_data import HandEyeData, Index, Mask
+from calibkit.estimation.hand_eye_methods import METHODS
+from calibkit.estimation.hand_eye_pairs import Spectrum, choose_pairs, motions, spectrum
+from calibkit.estimation.hand_eye_refine import SCALES, Refined, refine
+from calibkit.estimation.hand_eye_robust import all_pairs, pairs_within, seed
+from calibkit.estimation.hand_eye_trust import Advice, Lag, Open, Trust, good_poses, judge, lag
+from calibkit.estimation.hand_eye_world import WORLD_METHODS
+from calibkit.geometry import se3, so3
+from calibkit.geometry.so3 import Array
+from calibkit.solver import trust
+
+_EVERY_PAIR = 100  # poses: up to as many, all pairs
+_PAIRS = 300
+_FEWEST = 2
+_FEWEST_CHUNKS, _SHORTEST_CHUNK = 8, 8
+_TRIED_ON = 1000  # poses that a chunk's length is chosen by
+_FAR_FROM = 5.0  # sigmas of the refined X, and both limits below: a closed form that is farther has failed
+_FAR_TURN, _FAR_SHIFT = np.deg2rad(0.2), 5e-3
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to estimate."""
+
+    seed: int = 0  # of the draws
+    drift: bool | None = None  # the worlds drift apart, as odometries' do; None: in `motion`, what gives the smaller sigmas
+    methods: bool = True  # solve by every closed form too
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """How far P_i X Q_i^-1, which should be one transform, lies from its mean: rms over poses."""
+
+    angle: float  # rad
+    distance: float  # m
+
+
+@dataclass(frozen=True)
+class Method:
+    """What one way of solving gives, on the poses that the refinement kept."""
+
+    X: Array
+    scatter: Scatter
+    angle: float  # rad to the refined X
+    distance: float  # m
+    failed: bool  # far from the refined X by its sigmas and by more than 0.2 deg or 5 mm
+
+
+@dataclass(frozen=True)
+class HandEyeFit:
+    """X = T_1_2, and everything that says how good it is; covariances are of d in T exp(d), (rho m, phi rad)."""
+
+    data: HandEyeData
+    X: Array  # (4, 4)
+    cov_X: Array  # (6, 6) as residuals are
+    plain_cov_X: Array  # as if they were white
+    Z: Array | None  # (4, 4) T_w1_w2, None where there are several
+    cov_Z: Array | None
+    plain_cov_Z: Array | None
+    kept: Mask  # (n,) poses that took part
+    residual: Array  # (n, 6) local(Z Q_i, P_i X), in frame 2
+    chi2: Array  # (n,) of the residuals, 6 degrees of freedom
+    pairs: Index  # (k, 2) chosen ones of all poses, also wrong ones
+    pair_angle: Array  # (k,) rad between A X and X B
+    pair_distance: Array  # (k,) m
+    scatter: Scatter
+    methods: dict[str, Method]
+    noise: dict[str, float]  # sigmas: P_rotation rad, P_translation m or P_factor of the given covariance; likewise Q
+    noise_assumed: bool  # too few poses to tell it
+    spectrum: Spectrum  # of the kept poses' motions
+    open: tuple[Open, ...]  # what is weak or not observable, the weakest first
+    advice: tuple[Advice, ...]
+    lag: Lag | None
+    n_worlds: int
+    converged: bool
+    _refined: Refined
+    _trust: Trust
+
+    @property
+    def statuses(self) -> dict[str, Status]:
+        """Return the status of p and of R as wholes: that of their least known direction."""
+        found = {}
+        for name, part in (("p", slice(0, 3)), ("R", slice(3, 6))):
+            cov = self.cov_X[part, part] / SCALES[part, None] / SCALES[part]
+            found[name] = Status(trust.grade(float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))))
+        return found
+
+    def predict(self, n: int) -> Array:
+        """Return the covariance of X (6, 6) that n more good poses would bring: turned by 30 deg or more about all axes."""
+        return self._trust.predict(n * good_poses(self.data, self._refined))
+
+
+def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> HandEyeFit:
+    """Return X with its covariance; BadInputError with fewer than two poses in any world."""
+    settings = settings or Settings()
+    if data.n_worlds == 0 or np.bincount(data.world, minlength=data.n_worlds).min() < _FEWEST:
+        raise BadInputError(f"hand-eye needs two poses at least and has {len(data.P)}: record 10 or more, turned about two axes or more")
+    data = _in_chunks(data, settings)
+    found, trusted = _solve(data, settings)
+    X, Z = found.X, found.Z
+    pairs = _pairs(data, np.ones(len(data.P), bool))
+    good = _pairs(data, found.kept)
+    angle, distance = _apart(motions(data.P, pairs) @ X, X @ motions(data.Q, pairs))
+    one = data.n_worlds == 1
+    return HandEyeFit(
+        data=data,
+        X=X,
+        cov_X=trusted.cov_X,
+        plain_cov_X=trusted.plain_X,
+        Z=Z[0] if one else None,
+        cov_Z=trusted.cov_Z if one else None,
+        plain_cov_Z=trusted.plain_Z if one else None,
+        kept=found.kept,
+        residual=se3.local(Z[data.world] @ data.Q, data.P @ X),
+        chi2=found.chi2,
+        pairs=pairs,
+        pair_angle=angle,
+        pair_distance=distance,
+        scatter=scatter(data, X, found.kept),
+        methods=_methods(data, found, trusted.cov_X, good) if settings.methods and len(good) else {},
+        noise=found.noise,
+        noise_assumed=found.freedom == 0,
+        spectrum=spectrum(motions(data.P, good)),
+        open=trusted.open,
+        advice=trusted.advice,
+        lag=lag(data, found, trusted.inflation),
+        n_worlds=data.n_worlds,
+        converged=found.converged,
+        _refined=found,
+        _trust=trusted,
+    )
+
+
+def scatter(data: HandEyeData, X: Array, kept: Mask) -> Scatter:
+    """Return how far P_i X Q_i^-1 of kept poses lies from the mean of its world, rms."""
+    each = (data.P @ X @ se3.inverse(data.Q))[kept]
+    if not len(each):
+        return Scatter(0.0, 0.0)
+    world = np.unique(data.world[kept], return_inverse=True)[1]
+    sums = np.zeros((int(world.max()) + 1, 4, 4))
+    np.add.at(sums, world, each)
+    mean = se3.make(so3.project(sums[:, :3, :3]), sums[:, :3, 3] / sums[:, 3, 3, None])
+    angle, distance = _apart(mean[world], each)
+    return Scatter(float(np.sqrt(np.mean(angle**2))), float(np.sqrt(np.mean(distance**2))))
+
+
+def _solve(data: HandEyeData, settings: Settings) -> tuple[Refined, Trust]:
+    found = refine(data, seed(data, np.random.default_rng(settings.seed)))
+    return found, judge(data, found)
+
+
+def _in_chunks(data: HandEyeData, settings: Settings) -> HandEyeData:
+    """Return the problem of a moving pair with a new world every so often, where drift makes that the better known X.
+
+    Long chunks hold large turns, short ones little drift: the length is the one with the smallest covariance by the residuals themselves.
+    """
+    may = settings.drift if settings.drift is not None else data.setup == "motion"
+    if not may or data.n_worlds > 1 or data.t_s is None:
+        return data
+    order = np.argsort(data.t_s, kind="stable")
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order))
+    thin = order[:: max(1, len(order) // _TRIED_ON)]
+
+    def cut(chunks: int) -> HandEyeData:
+        return replace(data, world=rank * chunks // len(rank))
+
+    counts = [1] if settings.drift is None else []
+    chunks = _FEWEST_CHUNKS
+    while chunks * _SHORTEST_CHUNK <= len(thin):
+        counts.append(chunks)
+        chunks *= 2
+    if not counts:
+        return data
+    sizes = [np.linalg.slogdet(_solve(select(cut(c), thin), settings)[1].cov_X / SCALES[:, None] / SCALES)[1] for c in counts]
+    return cut(counts[int(np.argmin(sizes))])
+
+
+def select(data: HandEyeData, rows: Index) -> HandEyeData:
+    """Return the problem of some of its poses; worlds are numbered anew."""
+
+    def of(values: Array | None) -> Array | None:
+        return None if values is None else values[rows]
+
+    return replace(
+        data,
+        P=data.P[rows],
+        Q=data.Q[rows],
+        cov_P=of(data.cov_P),
+        cov_Q=of(data.cov_Q),
+        labels=tuple(data.labels[i] for i in rows),
+        t_s=of(data.t_s),
+        world=np.unique(data.world[rows], return_inverse=True)[1].astype(np.intp),
+    )
+
+
+def _pairs(data: HandEyeData, among: Mask) -> Index:
+    """Return pairs (k, 2): all up to 100 poses, beyond that those that turn far about different axes; of many worlds within each."""
+    at = np.flatnonzero(among)
+    if data.n_worlds > 1:
+        pairs = pairs_within(data.slots)
+        return pairs[among[pairs].all(axis=1)]
+    if len(at) <= _EVERY_PAIR:
+        return at[all_pairs(len(at))]
+    some = at[:: max(1, len(at) // _PAIRS)]
+    return some[choose_pairs(data.P[some], _PAIRS)]
+
+
+def _methods(data: HandEyeData, found: Refined, cov: Array, pairs: Index) -> dict[str, Method]:
+    """Return every closed form on the poses that were kept, failures too."""
+    A, B = motions(data.P, pairs), motions(data.Q, pairs)
+    solved: dict[str, Array] = {name: method(A, B, None) for name, method in METHODS.items()}
+    if data.n_worlds == 1:
+        solved |= {name: method(data.P[found.kept], data.Q[found.kept], None)[0] for name, method in WORLD_METHODS.items()}
+    sigma_p, sigma_R = (float(np.sqrt(np.linalg.eigvalsh(cov[part, part])[-1])) for part in (slice(0, 3), slice(3, 6)))
+    out = {}
+    for name, X in solved.items():
+        angle, distance = (float(v) for v in _apart(found.X, X))
+        failed = angle > max(_FAR_TURN, _FAR_FROM * sigma_R) or distance > max(_FAR_SHIFT, _FAR_FROM * sigma_p)
+        out[name] = Method(X, scatter(data, X, found.kept), angle, distance, failed)
+    return out
+
+
+def _apart(T: Array, other: Array) -> tuple[Array, Array]:
+    """Return angle (...) rad and distance (...) m between two poses."""
+    angle: Array = np.linalg.norm(so3.log(np.swapaxes(T[..., :3, :3], -1, -2) @ other[..., :3, :3]), axis=-1)
+    distance: Array = np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1)
+    return angle, distance

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from recording_helper import Make, write
 from time_offset_samples import R_OF_TO, camera_session, constant_rate, lens, path, seen_gyro, seen_poses, stamps, wheels_imu
 
-from calibkit.data.observations import ImuSamples, PoseSamples
+from calibkit.data.observations import ImuSamples, PoseSamples, Times
 from calibkit.data.result import ResidualSet
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import make_time_offset, make_transform
@@ -24,8 +25,6 @@ from calibkit.io.target_file import dump_target
 from calibkit.simulation.session import Session, simulate_views
 from calibkit.simulation.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-
 SAMPLES = Path(__file__).parent.parent / "sample_bags"
 README = Path(__file__).parent.parent / "README.md"
 TD = 0.025  # s: what every recording here has, t_to = t_of + td
@@ -35,9 +34,9 @@ DURATION_S = 20.0
 # What the sensors of one rig saw, in files.
 
 
-def table(file: Path, header: str, *columns: Array, form: str = "%.9f") -> Path:
-    rows = np.column_stack(columns[1:])
-    lines = [f"{t}," + ",".join(form % value for value in row) for t, row in zip(columns[0], rows, strict=True)]
+def table(file: Path, header: str, t_ns: Times, *columns: NDArray[Any], form: str = "%.9f") -> Path:
+    rows = np.column_stack(columns)
+    lines = [f"{t}," + ",".join(form % value for value in row) for t, row in zip(t_ns, rows, strict=True)]
     file.write_text("\n".join([header, *lines]) + "\n")
     return file
 

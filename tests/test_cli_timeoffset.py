@@ -459,6 +459,14 @@ def test_recordings_that_cannot_be_used_are_one_line(run: Run, body: Trajectory,
     none = tmp_path / "accel.csv"
     table(none, "t [ns],ax,ay,az", stamps(100, 5.0), np.random.default_rng(0).standard_normal((500, 3)))
     assert "accel) has no gyroscope" in run("timeoffset", none, pose_file).mistake
+    stood = poses_of(body)
+    stood = write_poses(tmp_path / "stood.csv", PoseSamples(stood.t_ns, 0 * stood.q + stood.q[0], 0 * stood.p, "world", "arm"))
+    assert "stood) gives one and the same value throughout" in run("timeoffset", imu_file, stood).mistake
+    assert "stood) gives one and the same value throughout" in run("timeoffset", stood, pose_file, "--to", "stood").mistake
+    slow = write_poses(tmp_path / "slow.csv", poses_of(body, 0.5))
+    assert "slow) has no turns: its samples lie more than 1 s apart" in run("timeoffset", imu_file, slow).mistake
+    zeros = table(tmp_path / "zeros.csv", "t [ns],yaw_rate", stamps(30, 10.0), np.zeros(300))
+    assert "zeros) gives one and the same value throughout" in run("timeoffset", imu_file, zeros).mistake
     (tmp_path / "empty.csv").write_text("")
     assert "empty.csv" in run("timeoffset", imu_file, tmp_path / "empty.csv").mistake
     assert "gone.csv" in run("timeoffset", imu_file, tmp_path / "gone.csv").mistake

@@ -104,9 +104,11 @@ def time_offset(
     assert seen_to.samples is not None
     rotation = _rotation(base, of, to) if options.fix_rotation else None
     pair = Pair(of.name, to.name, one_line(of.topic), one_line(to.topic), seen_of.method, seen_of.focal_px)
+    turns = seen_of.turns()
+    _refuse_lifeless(of, to, turns, seen_to.samples)
     try:
         settings = Settings(options.reach_s, options.step_s, rotation)
-        fit = fit_time_offset(seen_of.turns(), seen_to.samples, settings, progress)
+        fit = fit_time_offset(turns, seen_to.samples, settings, progress)
     except BadInputError as error:
         raise BadInputError(f"{recording.name}: {of.name} and {to.name}: {error}") from None
     spread = bootstrap_sigma(fit, options.bootstrap) if options.bootstrap else None
@@ -252,6 +254,19 @@ def _of_poses(job: _Job, poses: PoseSamples) -> Seen:
         R = np.swapaxes(so3.from_quat(poses.q), 1, 2)
         poses = PoseSamples(poses.t_ns, so3.to_quat(R), -(R @ poses.p[:, :, None])[:, :, 0], poses.child, poses.parent)
     return Seen(lambda: turns_of_poses(poses), poses, poses.t_ns, "poses")
+
+
+def _refuse_lifeless(of: Sensor, to: Sensor, turns: Turns, samples: ImuSamples | PoseSamples) -> None:
+    """Refuse what has no turns at all; a sensor at rest has some, of noise."""
+    same = "gives one and the same value throughout: is it frozen? it must turn"
+    if isinstance(samples, PoseSamples) and len(samples.q) and not np.any(samples.q != samples.q[0]):
+        raise BadInputError(f"{to.name} ({one_line(to.topic)}) {same}")
+    if len(turns.t_ns) == 1 or not any(turns.axes):
+        raise BadInputError(f"{of.name} ({one_line(of.topic)}) {same}")
+    if not len(turns.first):
+        raise BadInputError(
+            f"{of.name} ({one_line(of.topic)}) has no turns: its samples lie more than 1 s apart, or each is half a turn on"
+        )
 
 
 def _rotation(base: Rig, of: Sensor, to: Sensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

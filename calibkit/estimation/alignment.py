@@ -109,7 +109,8 @@ def _with_levels(a: Alignment, jitter: bool) -> Alignment:
     shape = np.ones(3)
     shape[axes] = median**2 / np.mean(median**2)
     noises = [part.stretch.noise(a.track, a.R, a.shift(part.stretch.t), shape) for part in a.parts]
-    return replace(a, shape=shape, levels=estimate_levels(noises, [each.reshape(-1) for each in left], jitter))
+    drifts = [part.stretch.drift for part in a.parts]
+    return replace(a, shape=shape, levels=estimate_levels(noises, [each.reshape(-1) for each in left], drifts, jitter))
 
 
 def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
@@ -219,17 +220,20 @@ def noise_information(a: Alignment) -> float:
 
 
 def epochs(a: Alignment, parts: Sequence[Array], by_axis: bool = False) -> tuple[Array, Array, Array]:
-    """Return each turn's information (n, 1, 1) and score (n, 1) of tau with all else eliminated, and its time (n,) s; or each axis' (n, d).
+    """Return each stretch's information (w, 1, 1) and score (w, 1) of tau with all else eliminated, and its time (w,) s.
 
-    With h = H^-1 e: X h / h_tau is tau's column without what the others explain.
+    With h = H^-1 e: X h / h_tau is tau's column without what the others explain. A shorter piece would not do: the stretch's bias is
+    fitted, so that its pieces scatter less than they are worth. `by_axis`: each turn's information and score by axis, (n, d).
     """
     H = _gram(parts)[:4, :4] + np.diag(_PRIOR)
     free = np.arange(0 if a.free_rotation else 3, 4)
     h = np.zeros(4)
     h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, -1]
-    u = np.concatenate([X[:, :4] @ h / h[3] for X in parts]).reshape(-1, len(a.R))
-    score = u * np.concatenate([X[:, 4] for X in parts]).reshape(-1, len(a.R))
-    t = np.concatenate([part.stretch.middle for part in a.parts])
+    columns = [X[:, :4] @ h / h[3] for X in parts]
+    scores = [u * X[:, 4] for u, X in zip(columns, parts, strict=True)]
     if by_axis:
-        return u**2, score, t
-    return np.sum(u**2, axis=1)[:, None, None], np.sum(score, axis=1)[:, None], t
+        t = np.concatenate([part.stretch.middle for part in a.parts])
+        return (np.concatenate(columns) ** 2).reshape(-1, len(a.R)), np.concatenate(scores).reshape(-1, len(a.R)), t
+    t = np.array([part.stretch.middle.mean() for part in a.parts])
+    information = np.array([u @ u for u in columns])
+    return information[:, None, None], np.array([each.sum() for each in scores])[:, None], t

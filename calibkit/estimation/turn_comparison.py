@@ -47,6 +47,13 @@ class Stretch:
     def axes(self) -> NDArray[np.intp]:
         return np.flatnonzero(self.turns.axes)
 
+    @property
+    def drift(self) -> Array:
+        """Return what a bias adds to its turns, (rows, d); without columns where it has none."""
+        d = len(self.axes)
+        columns = (self.turns.duration[:, None, None] * np.eye(d)).reshape(-1, d)
+        return columns if self.free_bias else columns[:, :0]
+
     def beta(self, track: OrientationTrack, shift: Array) -> Array:
         """Return the track's turns (n, k, 3) between stamps shifted by `shift` (m, k) s."""
         q = track.orientation(self.t[:, None] + shift)
@@ -94,11 +101,8 @@ def _seconds(t_ns: Times, origin_ns: int) -> Array:
 
 def weigh(stretch: Stretch, noise: TurnNoise, levels: NoiseLevels) -> Weighed:
     """Return the stretch with its noise whitened."""
-    whiten, d = noise.whitener(levels), len(stretch.axes)
-    if not stretch.free_bias:
-        return Weighed(stretch, whiten, np.zeros((d * len(stretch.turns.first), 0)), np.zeros((0, 0)))
-    columns = whiten((stretch.turns.duration[:, None, None] * np.eye(d)).reshape(-1, d))
-    return Weighed(stretch, whiten, *np.linalg.qr(columns))
+    whiten = noise.whitener(levels)
+    return Weighed(stretch, whiten, *np.linalg.qr(whiten(stretch.drift)))
 
 
 def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> tuple[Array, Array]:

@@ -450,7 +450,21 @@ def test_mistakes_are_one_line(run: Run, rich: Files, imu_file: Path, pose_file:
     assert "--step" in run("timeoffset", *pair, "--step", 0).mistake
     assert "--gyro-bandwidth" in run("timeoffset", *pair, "--gyro-bandwidth", -3).mistake
     assert "--bootstrap" in run("timeoffset", *pair, "--bootstrap", -1).mistake
+    assert "neither gives poses" in run("timeoffset", *rich.asked, "--inverse-poses").mistake
     assert not list(tmp_path.glob("*.npz"))
+
+
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [
+        (("--target", SAMPLES / "target.yaml"), "neither is a camera"),
+        (("--plain",), "it is for a camera's images without --target"),
+        (("--gyro-bandwidth", 40, "--of", "imu0", "--to", "pose0"), "pose0 is no IMU; give the IMU as --to"),
+        (("--exposure", 8), "pose0 is no camera; give the camera as --of"),
+    ],
+)
+def test_an_option_that_cannot_count_is_refused(run: Run, imu_file: Path, pose_file: Path, option: tuple[object, ...], why: str) -> None:
+    assert run("timeoffset", imu_file, pose_file, *option).mistake.endswith(why)
 
 
 def test_recordings_that_cannot_be_used_are_one_line(run: Run, body: Trajectory, imu_file: Path, pose_file: Path, tmp_path: Path) -> None:

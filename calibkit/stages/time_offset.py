@@ -98,6 +98,7 @@ def time_offset(
     recording = open_recording(list(sources), options.ros_distro, options.reading)
     job = _Job(recording, base, options, progress)
     of, to = _pair(_sensors(recording, base, options), options)
+    _refuse_idle(options, of, to)
     if to.kind == "image" and options.target is None:
         raise BadInputError(f"--to {to.name}: a camera without a board has turns between images only; swap --of and --to, or give --target")
     seen_to, seen_of = _look(job, to), _look(job, of)  # in this order: an IMU is soon read, and what is wrong with it told
@@ -254,6 +255,22 @@ def _of_poses(job: _Job, poses: PoseSamples) -> Seen:
         R = np.swapaxes(so3.from_quat(poses.q), 1, 2)
         poses = PoseSamples(poses.t_ns, so3.to_quat(R), -(R @ poses.p[:, :, None])[:, :, 0], poses.child, poses.parent)
     return Seen(lambda: turns_of_poses(poses), poses, poses.t_ns, "poses")
+
+
+def _refuse_idle(options: Options, of: Sensor, to: Sensor) -> None:
+    """Refuse options that say nothing about this pair: a person who gives one expects it to count."""
+    camera, poses, delays = ("image", "corners"), ("pose", "tf"), options.delays
+    board, both = options.target is not None, (of.kind, to.kind)
+    idle = {
+        "--target": board and not set(camera) & set(both) and "neither is a camera",
+        "--plain": options.plain and (board or "image" not in both) and "it is for a camera's images without --target",
+        "--inverse-poses": options.inverse_poses and not set(poses) & set(both) and "neither gives poses",
+        "--gyro-bandwidth": delays.gyro_bandwidth_hz is not None and to.kind != "imu" and f"{to.name} is no IMU; give the IMU as --to",
+        "--exposure and --readout": bool(delays.camera_s) and of.kind not in camera and f"{of.name} is no camera; give the camera as --of",
+    }
+    for name, why in idle.items():
+        if why:
+            raise BadInputError(f"{name} does not fit {of.name} and {to.name}: {why}")
 
 
 def _refuse_lifeless(of: Sensor, to: Sensor, turns: Turns, samples: ImuSamples | PoseSamples) -> None:

@@ -33,9 +33,7 @@ def run(
     rig: options.Rigs = None,
     report: options.Report = None,
     json_file: options.Json = None,
-    resolution: Annotated[
-        str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")
-    ] = None,
+    resolution: options.Resolution = None,
     loss: Annotated[
         str, typer.Option("--loss", help="robust (outliers are found and given up) or plain (least squares over everything).")
     ] = "robust",
@@ -59,7 +57,7 @@ def run(
     asked = Options(
         cameras=tuple(camera or ()),
         models=tuple(model or (AUTO,)),
-        resolution=_size(resolution),
+        resolution=options.size_of(resolution),
         robust=loss == "robust",
         max_views=max_views,
         cache=not no_cache,
@@ -67,14 +65,3 @@ def run(
     )
     outputs = options.outputs_of([*sources, target], out, report, json_file, rig, force)
     show(intrinsics(sources, target, outputs, asked, bar), strict)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    from calibkit.errors import BadInputError, one_line
-
-    if text is None:
-        return None
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:7]) < 100000 for part in parts):
-        raise BadInputError(f"--resolution {one_line(text)}: write WIDTHxHEIGHT in px, such as 752x480")
-    return int(parts[0]), int(parts[1])

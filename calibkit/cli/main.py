@@ -13,7 +13,19 @@ from calibkit.errors import BadInputError, CalibkitError, one_line
 from calibkit.version import __version__
 
 # One module `calibkit.cli.NAME` a command, with `register(app)`; --help lists them in this order.
-COMMANDS: tuple[str, ...] = ("target", "info", "intrinsics", "allan", "imu", "timeoffset", "report", "import_", "export", "simulate")
+COMMANDS: tuple[str, ...] = (
+    "target",
+    "info",
+    "intrinsics",
+    "allan",
+    "imu",
+    "timeoffset",
+    "handeye",
+    "report",
+    "import_",
+    "export",
+    "simulate",
+)
 
 _ANYWHERE = ("--version", "--debug")
 _INTERRUPTED = 130

@@ -25,6 +25,7 @@ AccelUnit = Annotated[
     str | None,
     typer.Option("--accel-unit", help="Unit of an IMU's file that does not say it: m/s^2, g, counts, ... [default: m/s^2]"),
 ]
+Resolution = Annotated[str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")]
 RosDistro = Annotated[str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")]
@@ -46,3 +47,15 @@ def outputs_of(
     refuse_clashes(inputs, [out, report, json_file, *others])
     refuse_clashes(rigs or (), [report, json_file, *others])  # OUT may be a rig: it is then updated
     return Outputs(out, report, json_file, tuple(rigs or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """Return width and height of `--resolution WxH`."""
+    from calibkit.errors import BadInputError, one_line
+
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:7]) < 100000 for part in parts):
+        raise BadInputError(f"--resolution {one_line(text)}: write WIDTHxHEIGHT in px, such as 752x480")
+    return int(parts[0]), int(parts[1])

@@ -44,7 +44,9 @@ COLUMNS: dict[str, tuple[Dtype, tuple[int, ...]]] = {
     **dict.fromkeys(("tau", "deviation", "fitted", "low", "high"), ("float64", ())),
     "attitude": ("float64", (3,)),
     **dict.fromkeys(("rate", "rate_before", "of_rate", "delay", "window_offset", "window_sigma", "clock"), ("float64", ())),
-    "before": ("float64", (3,)),
+    **dict.fromkeys(("before", "turn", "place", "motion"), ("float64", (3,))),
+    "rotation": ("float64", (4,)),
+    "px": ("float64", ()),
 }
 
 ArrayName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]

@@ -12,7 +12,7 @@ from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import PICTURES, Picture, draw
 from calibkit.report.parameters import sigma_note
-from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines
+from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines, stage_tables
 from calibkit.report.view import View
 from calibkit.version import __version__
 
@@ -39,6 +39,7 @@ def build(summary: Summary) -> dict[str, bytes]:
     page = _template().render(
         summary=summary,
         told=[*camera_lines(summary), *stage_lines(summary)],
+        tables=stage_tables(summary),
         meaning=MEANING[summary.verdict],
         sections=[(view, sorted(drawn, key=lambda pair: PICTURES.index(pair[0]))) for view, drawn in sections.values()],
         thumbnails=thumbnails,

@@ -67,6 +67,7 @@ def text(summary: Summary) -> str:
     """Return verdict, reasons and tables for a terminal; what came from files is stripped of control characters."""
     told = [*camera_lines(summary), *stage_lines(summary)]
     lines = [*told, ""] if told else []
+    lines += [_table(cells) for cells in stage_tables(summary)]
     lines += [_parameter_table(summary)]
     if any(row.factor for row in summary.parameters):
         lines.append(f"{sigma_note(summary.rig)}\n")
@@ -86,6 +87,17 @@ def stage_lines(summary: Summary) -> list[str]:
         for lines in found
         if isinstance(lines, list)
         for line in map(str, lines)
+    ]
+
+
+def stage_tables(summary: Summary) -> list[list[list[str]]]:
+    """Return the stages' own tables of texts, heads first, rows of equal length."""
+    found = [result.facts.get("tables") for result in summary.results]
+    tables = [table for tables in found if isinstance(tables, list) for table in tables if isinstance(table, list) and table]
+    return [
+        [[str(cell) for cell in row] for row in table]
+        for table in tables
+        if all(isinstance(row, list) and len(row) == len(table[0]) > 0 for row in table)
     ]
 
 

@@ -28,12 +28,13 @@ class Words:
     mover: str
     P_at_world: bool  # noise and motion are those of P^-1's right tangent
     Q_at_world: bool  # a board's pose errs about the board
+    arm: bool  # P is an arm's
 
 
 WORDS: dict[str, Words] = {
-    "eye-in-hand": Words(("gripper", "cam", "base", "target"), "gripper", False, True),
-    "eye-to-hand": Words(("base", "cam", "gripper", "target"), "gripper", True, True),
-    "motion": Words(("sensor1", "sensor2", "world1", "world2"), "sensor1", False, False),
+    "eye-in-hand": Words(("gripper", "cam", "base", "target"), "gripper", False, True, True),
+    "eye-to-hand": Words(("base", "cam", "gripper", "target"), "gripper", True, True, True),
+    "motion": Words(("sensor1", "sensor2", "world1", "world2"), "sensor1", False, False, False),
 }
 
 

@@ -93,10 +93,13 @@ def _lines(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
     ]
     if not known:
         return lines
-    low, high = (fit.coarse_ns * 1e-9 + end for end in fit.interval)
+    ends = [fit.coarse_ns * 1e-9 + end for end in fit.interval]
+    unit, scale = ("ms", 1e3) if abs(fit.td) < 1 else ("s", 1.0)
+    digits = int(np.clip(1 - np.floor(np.log10(max(scale * fit.sigma, 1e-9))), 1, 9))
+    td, low, high = (f"{scale * value:+.{digits}f}" for value in (fit.td, *ends))
     lines += [
         f"  t_{pair.to} = t_{pair.of} + td: {early_or_late(pair.of, fit.td)}",
-        f"  td {fit.td * 1e3:+.4f} +- {fit.sigma * 1e3:.2g} ms; 95 %: {low * 1e3:+.4f} to {high * 1e3:+.4f} ms (profile likelihood)"
+        f"  td {td} +- {scale * fit.sigma:.{digits}f} {unit}; 95 %: {low} to {high} {unit} (profile likelihood)"
         + ("" if bootstrap is None else f"; bootstrap over stretches: +- {bootstrap * 1e3:.2g} ms"),
     ]
     if abs(fit.td) < 1:

@@ -274,7 +274,9 @@ def test_a_bag_of_tf_twists_and_imu(run: Run, body: Trajectory, tmp_path: Path) 
     assert_found(offset(tmp_path / "tf.yaml", "dt_imu0_pose0"))
     assert_told(run("timeoffset", bag, "-o", tmp_path / "odom.yaml"), "odom0", "imu0")
     assert_found(offset(tmp_path / "odom.yaml", "dt_imu0_odom0"), within=5e-3)
-    assert "map" in run("timeoffset", bag, "--pose", "tf:map/gone", "--of", "pose0").mistake
+    assert "the recording's frames: map, tool" in run("timeoffset", bag, "--pose", "tf:map/gone", "--of", "pose0").mistake
+    for odd in ("/tf", "tf:", "tf:map"):
+        assert "name two frames, --pose tf:PARENT/CHILD" in run("timeoffset", bag, "--pose", odd, "--of", "pose0").mistake
 
 
 # How sensors are named.

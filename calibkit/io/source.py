@@ -19,7 +19,7 @@ USES = {
     "imu": "allan, imu, timeoffset; joint (yet to come)",
     "pose": "timeoffset; handeye (yet to come)",
     "twist": "timeoffset",
-    "tf": "handeye, timeoffset (yet to come)",
+    "tf": "timeoffset (with --pose tf:PARENT/CHILD); handeye (yet to come)",
     "camera_info": "the driver's own calibration, to compare with",
     "corners": "intrinsics (with --target and --resolution), timeoffset (with --target)",
     "cloud": "nothing yet",

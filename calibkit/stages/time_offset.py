@@ -246,7 +246,9 @@ def _poses(job: _Job, sensor: Sensor) -> Seen:
 
 
 def _tf(job: _Job, sensor: Sensor) -> Seen:
-    parent, _, child = sensor.topic.removeprefix("tf:").partition("/")
+    parent, _, child = sensor.topic.removeprefix("tf:").removeprefix("/").partition("/")
+    if not (sensor.topic.startswith("tf:") and parent and child):
+        raise BadInputError(f"--pose {one_line(sensor.topic)}: of a tf tree name two frames, --pose tf:PARENT/CHILD")
     return _of_poses(job, job.recording.tf(parent, child))
 
 

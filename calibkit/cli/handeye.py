@@ -72,7 +72,7 @@ def run(
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
     from calibkit.stages.handeye import hand_eye
-    from calibkit.stages.handeye_poses import Options
+    from calibkit.stages.handeye_sides import Options
 
     asked = Options(
         poses=poses,

@@ -1,6 +1,6 @@
 """Which way round the poses are: camera on the gripper or beside the robot, poses or their inverses, by what fits far better."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,12 +45,7 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
     ranked = sorted(candidates, key=lambda setup: left[SIGNS[setup]])
     setup, line = asked or ranked[0], ""
     if asked is None and len(ranked) > 1:
-        times = left[SIGNS[ranked[1]]] / left[SIGNS[setup]]
-        if times < CLEARLY:
-            raise BadInputError(
-                f"the poses do not tell {' from '.join(ranked)} ({times:.2g} times better): give --setup {' or '.join(ranked)}"
-            )
-        line = f"{_SETUP_WORDS.get(setup, setup)}: it fits {times:.3g} times better than {ranked[1]}"
+        line = _clearly(ranked, left[SIGNS[ranked[1]]] / left[SIGNS[setup]])
         if set(candidates) <= set(_SETUP_WORDS):
             line += "; with the poses the other way round (T_gripper_base) it would be the other one"
     own = left[SIGNS[setup]]
@@ -64,10 +59,27 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
     return Choice(setup, line, f"--setup {_SETUP_WORDS.get(other, other)}, or {better}," if other else better, times)
 
 
+def choose_pairing(problems: Mapping[str, HandEyeData]) -> tuple[str, str]:
+    """Return the setup whose own pairs leave far less, and how it was chosen; BadInputError where none does clearly."""
+    left = {setup: misfit(calibrate_hand_eye(_thinned(data), Settings(drift=False, methods=False))) for setup, data in problems.items()}
+    ranked = sorted(left, key=lambda setup: left[setup])
+    if len(ranked) == 1:
+        return ranked[0], ""
+    return ranked[0], _clearly(ranked, left[ranked[1]] / left[ranked[0]])
+
+
+def _clearly(ranked: Sequence[str], times: float) -> str:
+    if times < CLEARLY:
+        asked = " or ".join(ranked)
+        raise BadInputError(f"the poses do not tell {' from '.join(ranked)} ({times:.2g} times better): give --setup {asked}")
+    return f"{_SETUP_WORDS.get(ranked[0], ranked[0])}: it fits {times:.3g} times better than {ranked[1]}"
+
+
+def _thinned(data: HandEyeData) -> HandEyeData:
+    return select(data, np.unique(np.linspace(0, len(data.P) - 1, min(len(data.P), _TRIED_ON)).round().astype(np.intp)))
+
+
 def _left(first: Array, second: Array, p: int, q: int) -> float:
     """Return what the poses leave, each side as it is (1) or inverted (-1)."""
     P, Q = (T if sign > 0 else se3.inverse(T) for T, sign in ((first, p), (second, q)))
-    data = HandEyeData("motion", P, Q)
-    rows = np.unique(np.linspace(0, len(P) - 1, min(len(P), _TRIED_ON)).round().astype(np.intp))
-    fit = calibrate_hand_eye(select(data, rows), Settings(drift=False, methods=False))
-    return misfit(fit)
+    return misfit(calibrate_hand_eye(_thinned(HandEyeData("motion", P, Q)), Settings(drift=False, methods=False)))

@@ -20,7 +20,8 @@ from calibkit.estimation.hand_eye_verdict import Doubts
 from calibkit.estimation.hand_eye_world import WORLD_METHODS
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
-from calibkit.stages.handeye_poses import Options, Sides, gather
+from calibkit.stages.handeye_poses import gather
+from calibkit.stages.handeye_sides import Options, Sides
 from calibkit.stages.outputs import Outputs, Saved, save
 
 MAX_PREDICTED = 10_000
@@ -35,7 +36,7 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     _check(options)
     base = outputs.open()
     sides = gather(sources, base, options, progress)
-    choice = Choice("motion") if options.motions else choose_setup(sides.first, sides.second, options.setup, sides.candidates)
+    choice = _choice(sides, options)
     data = _problem(sides, choice, options)
     fit = calibrate_hand_eye(data)
     if not fit.converged:
@@ -51,7 +52,12 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
         doubts,
     )
     result = hand_eye_result(fit, asked)
-    result = replace(result, facts={**result.facts, "warnings": list(sides.warnings)})
+    result = replace(
+        result,
+        rig=result.rig.model_copy(update={"time_offsets": sides.offsets}),
+        reasons=(*result.reasons, *sides.reasons),
+        facts={**result.facts, "warnings": list(sides.warnings)},
+    )
     if sides.board is not None and sides.board.lens is not None:
         result = _with_lens(result, sides.board.lens)
     return save(result, base, outputs, sides.inputs, _told(options, data.setup))
@@ -67,7 +73,16 @@ def _check(options: Options) -> None:
         raise BadInputError(f"--predict {options.predict}: give 0 to {MAX_PREDICTED}")
 
 
+def _choice(sides: Sides, options: Options) -> Choice:
+    if options.motions:
+        return Choice("motion")
+    asked = options.setup if sides.data is None else sides.data.setup
+    return choose_setup(sides.first, sides.second, asked, sides.candidates)
+
+
 def _problem(sides: Sides, choice: Choice, options: Options) -> HandEyeData:
+    if sides.data is not None:
+        return sides.data
     frames = sides.words(choice.setup)
     if options.motions:
         return of_motions(sides.first, sides.second, sides.labels, frames)

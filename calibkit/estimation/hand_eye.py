@@ -18,10 +18,10 @@ from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
 
 _EVERY_PAIR = 100  # poses: up to as many, all pairs
-_PAIRS = 300
+_PAIRS = 150
 _FEWEST = 2
-_FEWEST_CHUNKS, _SHORTEST_CHUNK = 8, 8
-_TRIED_ON = 1000  # poses that a chunk's length is chosen by
+_FEWEST_CHUNKS, _SHORTEST_CHUNK = 8, 5
+_TRIED_ON = 600  # poses that a chunk's length is chosen by
 _FAR_FROM = 5.0  # sigmas of the refined X, and both limits below: a closed form that is farther has failed
 _FAR_TURN, _FAR_SHIFT = np.deg2rad(0.2), 5e-3
 

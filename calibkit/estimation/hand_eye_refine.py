@@ -1,11 +1,11 @@
 """Joint maximum likelihood of X, each world's Z and every true pose, with noise on both sides whose size the residuals tell.
 
-Unknown are X, Z_w and the true M_i = T_w2_2(i), with Q_i = M_i exp(q_i) and P_i = Z_w M_i X^-1 exp(p_i). In M's right tangent, to first order
+Unknown are X, Z_w and the true M_i = T_w2_2(i): Q_i = M_i exp(q_i), P_i = Z_w M_i X^-1 exp(p_i). In M_i's right tangent, to first order
 
-    e_i = local(Z_w M_i X^-1, P_i) - local(M_i, Q_i) = -x + Ad(M_i^-1) z_w + noise of covariance C_i = C_P,i + C_Q,i,
+    e_i = Ad(X^-1) local(Z_w M_i X^-1, P_i) - local(M_i, Q_i) = -x + Ad(M_i^-1) z_w + noise of covariance C_i = C_P,i + C_Q,i.
 
-the first local carried by Ad(X^-1); eliminating M_i leaves 6 equations a pose (Gauss-Helmert), and the Jacobians are those at the adjusted poses:
-at the measured ones the noise in them would count as knowledge of X.
+Eliminating M_i leaves these 6 equations a pose (Gauss-Helmert). The Jacobians are those at the adjusted poses: at the measured ones, the
+noise in them would count as knowledge of X.
 """
 
 from dataclasses import dataclass, replace
@@ -107,7 +107,7 @@ def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Norma
     JW = np.swapaxes(J_Z, 1, 2) @ W * (kept | ~active)[:, None, None]
     A = _by_world(data, JW @ J_Z) + np.diag(_FAR)
     right = _by_world(data, np.concatenate([JW, (JW @ e[:, :, None])], axis=2))
-    solved = np.linalg.solve(A, right)
+    solved = np.asarray(np.linalg.solve(A, right), np.float64)
     follow, apart = solved[:, :, :6], solved[:, :, 6]
     J_X = J_Z @ follow[data.world] - np.eye(6)
     RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
@@ -117,7 +117,7 @@ def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Norma
 
 
 def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal, chance: bool = True) -> tuple[Array, Normal]:
-    """Return X's covariance (6, 6) by the information that is not made by the noise in the adjusted poses, and the system with what is free.
+    """Return X's covariance (6, 6) by what the noise in the adjusted poses has not made, and the system with what is free.
 
     A pose's error d ~ D moves Ad(M) to Ad(M) (I + ad(d)): poses at rest would have sum E[ad(d)^T C^-1 ad(d)] of information. What is more
     than that, and than chance can add (Davidson and Szarek 2001, as in hand_eye_pairs.Spectrum.rank), is knowledge.
@@ -154,7 +154,7 @@ def _by_world(data: HandEyeData, values: Array) -> Array:
 def refine(data: HandEyeData, start: Seed) -> Refined:
     """Return the optimum from a seed: a step, the noise and the choice of poses in turn until none of them changes any more."""
     X, Z, M, kept = start.X, start.Z, data.Q, start.kept
-    e, kinds = _residuals(data, X, Z, M)
+    e, kinds = residuals(data, X, Z, M)
     theta, least, most = _first_noise(data, e[kept])
     system: Normal | None = None
     reversals, converged = 0, False
@@ -175,7 +175,7 @@ def refine(data: HandEyeData, start: Seed) -> Refined:
         chi2 = _chi2(data, C, left, kept, system)
         m = se3.local(M, data.Q) + ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
         X, Z, M = se3.retract(X, x), se3.retract(Z, z), se3.retract(M, m)
-        e, kinds = _residuals(data, X, Z, M)
+        e, kinds = residuals(data, X, Z, M)
         if number >= _STILL and (noise_settled or number >= _LONG) and float(x @ system.S @ x) < _SETTLED:
             now = chi2 < wrong_beyond(freedom) if freedom else kept
             if np.array_equal(now, kept) or reversals == _MAX_REVERSALS:
@@ -189,7 +189,7 @@ def refine(data: HandEyeData, start: Seed) -> Refined:
     )
 
 
-def _residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, Array]:
+def residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, Array]:
     """Return e (n, 6) and the covariances (n, k, 6, 6) of one unit of each kind of noise, P's first."""
     P = Z[data.world] @ M @ se3.inverse(X)
     on_P = se3.adjoint(se3.inverse(X))
@@ -236,8 +236,8 @@ def _first_noise(data: HandEyeData, e: Array) -> tuple[Array, Array, Array]:
 def _by_reach(data: HandEyeData, kept: Mask, theta: Array) -> Array:
     """Return the least variances of an arm: its angle errors move the hand by its reach times as much.
 
-    Residuals may show less, as they are not white: a grid of poses, one lens. Then positions so weighed turn R, by 0.07 deg of 0.02 in a
-    real recording of 28 poses.
+    A choice, not a measurement: residuals of a grid of poses and one lens are not white and may show less. Positions weighed by them then
+    turned R of a real arm (28 poses) by 0.07 deg, three of its sigmas, away from every closed form.
     """
     out = np.zeros(len(theta))
     if data.cov_P is None and data.words.arm:
@@ -271,7 +271,7 @@ def _noise(data: HandEyeData, kinds: Array, theta: Array, e: Array, kept: Mask, 
 
 
 def _chi2(data: HandEyeData, C: Array, left: Array, kept: Mask, system: Normal) -> Array:
-    """Return each pose's residual against its covariance, smaller than C where the pose took part in the fit and larger where it did not."""
+    """Return each pose's residual against its covariance: smaller than C where it took part in the fit, larger where it did not."""
     by_world, by_X = system.spread_parts(data)
     count = np.bincount(data.world, kept, data.n_worlds)[data.world]
     in_world, in_X = kept | (count < 2), kept & (count >= 2)

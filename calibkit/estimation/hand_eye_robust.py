@@ -133,7 +133,7 @@ def pairs_within(slots: Index) -> Index:
 
 
 def _scores(X: Array, A: Array, B: Array) -> Array:
-    """Return log of the product of the 40 % quantiles of angle and distance between A X and X B, for X (d, 4, 4): no noise level is needed."""
+    """Return, for X (d, 4, 4), the log of the product of the 40 % quantiles of angle and of distance between A X and X B: free of scale."""
     AX = np.einsum("kab,dbc->dkac", A[:, :3], X, optimize=True)
     XB = np.einsum("dab,kbc->dkac", X[:, :3], B, optimize=True)
     left = AX - XB

@@ -1,4 +1,4 @@
-"""How far X may be trusted: covariance, what the poses leave open and the poses to add in words, what more poses would bring, a suspected lag."""
+"""How far X may be trusted: covariance, what the poses leave open and which to add in words, what more would bring, a suspected lag."""
 
 from dataclasses import dataclass
 
@@ -94,7 +94,7 @@ def _few(freedom: int) -> float:
 
 
 def _sandwich(data: HandEyeData, fit: Refined, system: Normal) -> tuple[Array, Array]:
-    """Return the covariance (12, 12) of what is free of x, and of the first z, for white residuals and for those that are neither white nor equal.
+    """Return the covariance (12, 12) of what is free of x, and of the first z, for white residuals and for residuals as they are.
 
     Of more worlds than one, each is a block about x alone.
     """
@@ -143,22 +143,16 @@ def _named(data: HandEyeData, X: Array, basis: Array, cov_X: Array, grade: trust
     one, two, _, _ = data.words.frames
     name, R = f"T_{one}_{two}", X[:3, :3]
     _, s, Vt = np.linalg.svd(basis[3:])
-    s = np.concatenate([s, np.zeros(len(Vt) - len(s))])
-    columns = basis @ Vt.T
+    columns, turns = (basis @ Vt.T).T, np.append(s, np.zeros(len(Vt)))[: len(Vt)] > _PURE
+    p_alone = columns[~turns, :3]
+    # What p alone may do anyway is no part of a turn.
+    across = np.eye(3) - p_alone.T @ np.linalg.pinv(p_alone.T)
     out = []
-    p_alone = [columns[:, i] for i in range(len(Vt)) if s[i] <= _PURE]
-    texts = [f"p of {name} along {_axis_of(one, R @ v[:3])}" for v in p_alone]
-    for i in range(len(Vt)):
-        if s[i] > _PURE:
-            v = columns[:, i]
-            # What p alone may do anyway is no part of the turn.
-            follows = np.linalg.norm(v[:3] - sum((u[:3] * (u[:3] @ v[:3]) for u in p_alone), np.zeros(3))) > _PURE
-            texts.append(f"R of {name} about {_axis_of(one, R @ v[3:])}" + (", and p with it" if follows else ""))
-            p_alone = [*p_alone]
-            out.append(v)
-    vectors = p_alone + out
-    sigmas = [float(np.sqrt(v @ (cov_X / SCALES[:, None] / SCALES) @ v)) for v in vectors]
-    return [Open(t, s, grade, v) for t, s, v in sorted(zip(texts, sigmas, vectors, strict=True), key=lambda item: -item[1])]
+    for v, turn in zip(columns, turns, strict=True):
+        follows = ", and p with it" if np.linalg.norm(across @ v[:3]) > _PURE else ""
+        text = f"R of {name} about {_axis_of(one, R @ v[3:])}{follows}" if turn else f"p of {name} along {_axis_of(one, R @ v[:3])}"
+        out.append(Open(text, float(np.sqrt(v / SCALES @ cov_X @ (v / SCALES))), grade, v))
+    return sorted(out, key=lambda direction: -direction.sigma)
 
 
 def _axis_of(frame: str, v: Array) -> str:
@@ -190,7 +184,7 @@ def information(M: Array, C: Array) -> Array:
 
 
 def good_poses(data: HandEyeData, fit: Refined) -> Array:
-    """Return the mean information (12, 12) of one more pose, turned by 30 deg about any of the mover's axes, or as far as the others are."""
+    """Return the mean information (12, 12) of one more pose, turned about any of the mover's axes by 30 deg or as far as the others."""
     world = int(np.argmax(np.bincount(data.world, fit.kept, data.n_worlds)))
     own = fit.M[fit.kept & (data.world == world), :3, :3]
     turn = so3.log(so3.project(own.sum(axis=0)).T @ own) if len(own) else np.zeros((1, 3))

@@ -1,0 +1,85 @@
+"""Hand-eye of two pose streams: the offset of their clocks by how they turn, then together with X by the whole poses."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calibkit.data.progress import Progress, silent
+from calibkit.data.verdict import Reason, Verdict
+from calibkit.estimation import hand_eye
+from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
+from calibkit.estimation.hand_eye_refine import believed, normal
+from calibkit.estimation.pose_interpolation import PoseStream
+from calibkit.estimation.pose_offset import milliseconds
+from calibkit.estimation.pose_pairing import Pairing, Settings, aligned, pair_poses
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+
+_ROUNDS = 4
+_SETTLED = 0.2  # sigmas
+_BLOCK_S = 2.0  # residuals farther apart are taken for independent
+_DISAGREE = 4.0  # sigmas
+_WORTH_S = 1e-3
+
+
+def calibrate_streams(
+    P: PoseStream,
+    Q: PoseStream,
+    setup: str,
+    settings: Settings | None = None,
+    fitting: hand_eye.Settings | None = None,
+    frames: tuple[str, str, str, str] | None = None,
+    progress: Progress = silent,
+) -> tuple[Pairing, HandEyeFit]:
+    """Return pairs and X; an offset that the turns told is moved to where P X = Z Q fits best, and its sigma is in X's covariance.
+
+    P and Q are T_w1_1 and T_w2_2 as `hand_eye_world.SETUPS` means them.
+    """
+    settings, fitting = settings or Settings(), fitting or hand_eye.Settings()
+    both = aligned(P, Q, settings, progress)
+    first = both.offset
+    pairing = pair_poses(both, settings)
+    fit = calibrate_hand_eye(pairing.data(setup, frames), fitting)
+    if pairing.kind == "moving":
+        for _ in range(_ROUNDS if first.known == "turns" else 0):
+            change, sigma, _ = offset_left(pairing, fit)
+            both = replace(both, offset=both.offset.moved(change, sigma))
+            pairing = pair_poses(both, replace(settings, rests=False))
+            data = pairing.data(setup, frames)
+            worlds = np.arange(len(data.P)) * fit.n_worlds // len(data.P)  # as they were chosen
+            fit = calibrate_hand_eye(replace(data, world=worlds), replace(fitting, drift=False))
+            if abs(change) < _SETTLED * sigma:
+                break
+        follow = offset_left(pairing, fit)[2]
+        more = both.offset.sigma**2 * np.outer(follow, follow)
+        fit = replace(fit, cov_X=fit.cov_X + more, plain_cov_X=fit.plain_cov_X + more)
+    apart = abs(both.offset.dt - first.dt)
+    if apart > max(_DISAGREE * float(np.hypot(first.sigma, both.offset.sigma)), _WORTH_S):
+        text = (
+            f"dt_{P.name}_{Q.name}: whole poses have {milliseconds(both.offset.dt, both.offset.sigma)}, turns from one pose to the next "
+            f"{milliseconds(first.dt, first.sigma)}: stamps that jitter, or one of them smooths its poses; the former is used"
+        )
+        pairing = replace(pairing, reasons=(*pairing.reasons, Reason(Verdict.CHECK, text)))
+    return pairing, fit
+
+
+def offset_left(pairing: Pairing, fit: HandEyeFit) -> tuple[float, float, Array]:
+    """Return by how much dt is to change, its sigma (s), and how X follows a change, x (6,) per s in X's right tangent.
+
+    e_i + g_i d, g = Ad(X^-1) twist where P is read and twist where Q is: least squares with x and z eliminated; the sigma is by
+    blocks of two seconds, whose residuals are alike (Liang and Zeger 1986), or that of white ones if larger.
+    """
+    data, found = fit.data, fit._refined
+    g = pairing.twist @ se3.adjoint(se3.inverse(found.X)).T if pairing.read_P else pairing.twist
+    system = believed(data, found.C, found.C_P, found.kept, normal(data, found.M, found.C, g, found.kept))[1]
+    x = system.cov @ system.gradient
+    z = system.apart + system.follow @ x
+    used = found.kept & system.active
+    g = (g + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0])[used]
+    W = np.linalg.solve(found.C[used], g[:, :, None])[:, :, 0]
+    tells, pull = np.sum(W * g, axis=1), np.sum(W * found.e[used], axis=1)
+    whole = max(float(tells.sum()), 1e-300)
+    change = -float(pull.sum()) / whole
+    block = (pairing.t_s[used] / _BLOCK_S).astype(np.intp)
+    scores = np.bincount(block, pull + tells * change)
+    return change, float(max(np.linalg.norm(scores) / whole, whole**-0.5)), x

@@ -1,0 +1,91 @@
+"""How far the clocks of two pose streams are apart: as given, by how both turn, or none where they share one clock."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibkit.data.observations import PoseSamples, Times
+from calibkit.data.progress import Progress, silent
+from calibkit.data.verdict import Reason, Status
+from calibkit.errors import BadInputError
+from calibkit.estimation.pose_interpolation import PoseStream, without_repeats
+from calibkit.estimation.stamps import check_stamps
+from calibkit.estimation.time_offset import Settings, TimeOffsetFit, fit_time_offset
+from calibkit.estimation.time_offset_verdict import judge_time_offset
+from calibkit.estimation.turns import turns_of_orientations
+from calibkit.geometry import so3
+from calibkit.geometry.so3 import Array
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """t_P = t_Q + dt, and how it is known."""
+
+    dt: float  # s; of a clock that drifts or jumps, at its reference time
+    sigma: float
+    known: str  # "given", "assumed", "turns" or, by the fit of X too, "poses"
+    fit: TimeOffsetFit | None = None  # of the slower stream's turns to the faster one
+
+    def on_fast(self, t_ns: Times, read_P: bool) -> Times:
+        """Return the slower stream's stamps on the faster one's clock, P's where `read_P`."""
+        dt = self.dt if read_P else -self.dt
+        if self.fit is None:
+            out: Times = t_ns + np.int64(round(dt * 1e9))
+            return out
+        a = self.fit.alignment
+        coarse = t_ns + np.int64(self.fit.coarse_ns)
+        at: Array = np.asarray((coarse - a.track.origin_ns) * 1e-9, np.float64)
+        shift = a.shift(at) + (dt - self.fit.td)
+        return np.asarray(coarse + np.round(shift * 1e9).astype(np.int64))
+
+    def moved(self, change: float, sigma: float) -> "ClockOffset":
+        """Return the offset as whole poses have it."""
+        return replace(self, dt=self.dt + change, sigma=sigma, known="poses")
+
+    def told(self, P: str, Q: str) -> str:
+        """Return the offset in words."""
+        how = {
+            "given": "as given",
+            "assumed": "assumed, as both have one clock",
+            "turns": "by how both turn",
+            "poses": "estimated together with the transform",
+        }
+        return f"t_{P} = t_{Q} + dt, dt = {milliseconds(self.dt, self.sigma)}, {how[self.known]}"
+
+
+def milliseconds(dt: float, sigma: float) -> str:
+    """Return an offset with its sigma, in ms or, where it is long, in s."""
+    text = f"{dt * 1e3:+.3f} ms" if abs(dt) < 1 else f"{dt:+.6f} s"
+    return f"{text} +- {sigma * 1e3:.2g} ms" if sigma else text
+
+
+def offset_by_turns(
+    slow: PoseStream, fast: PoseStream, read_P: bool, one_clock: bool, progress: Progress = silent
+) -> tuple[ClockOffset, list[str], tuple[Reason, ...]]:
+    """Return the offset, what is to be said of it, and its verdict's reasons; a weak one is none: its sigma goes into what follows.
+
+    BadInputError where the streams do not tell it and have clocks of their own.
+    """
+    P, Q = (fast, slow) if read_P else (slow, fast)
+    name = f"dt_{fast.name}_{slow.name}"
+    reasons: tuple[Reason, ...] = ()
+    try:
+        fit = _fit(slow, fast, progress)
+    except BadInputError as error:
+        why = str(error)
+    else:
+        judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns) for each in (P, Q)})
+        if judged.status is not Status.NOT_OBSERVABLE:
+            offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit)
+            return offset, [], tuple(reason for reason in judged.reasons if f"{name}: weak:" not in reason.text)
+        why, reasons = judged.reasons[0].text.removeprefix(f"{name}: "), judged.reasons[1:]
+    if not one_clock:
+        raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}; or give {name} in a rig file")
+    return ClockOffset(0.0, 0.0, "assumed"), [f"the poses do not tell the offset of {P.name} and {Q.name}: {why}"], reasons
+
+
+def _fit(slow: PoseStream, fast: PoseStream, progress: Progress) -> TimeOffsetFit:
+    moves = without_repeats(slow)
+    turns = turns_of_orientations(moves.t_ns, so3.to_quat(moves.T[:, :3, :3]), None if moves.cov is None else moves.cov[:, 3:, 3:])
+    reference = PoseSamples(fast.t_ns, so3.to_quat(fast.T[:, :3, :3]), fast.T[:, :3, 3], "world", fast.name)
+    return fit_time_offset(turns, reference, Settings(), progress)

@@ -102,6 +102,22 @@ def test_right_jacobian_is_the_derivative_of_exp() -> None:
     np.testing.assert_allclose(so3.right_jacobian(v), np.stack(steps, axis=-1) / (2 * h), atol=1e-9)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 1e-3, 0.0999, 0.1001, 1.0, 3.1, np.pi, 4.0])
+def test_right_jacobian_inverse_is_one(angle: float) -> None:
+    v = angle * axes()
+    np.testing.assert_allclose(so3.right_jacobian_inverse(v) @ so3.right_jacobian(v), np.broadcast_to(np.eye(3), (*v.shape, 3)), atol=2e-15)
+
+
+def test_quaternions_multiply_and_add_up_as_matrices_do() -> None:
+    v, w = 0.7 * axes(), np.array([3.0, -0.4, 0.2]) * np.ones_like(axes())
+    p, q = so3.quat_exp(v), so3.quat_exp(w)
+    np.testing.assert_allclose(so3.from_quat(p), so3.exp(v), atol=1e-15)
+    np.testing.assert_allclose(so3.from_quat(so3.quat_multiply(p, q)), so3.exp(v) @ so3.exp(w), atol=1e-15)
+    np.testing.assert_allclose(so3.quat_multiply(so3.quat_conjugate(p), p), np.broadcast_to([0, 0, 0, 1.0], p.shape), atol=1e-15)
+    for tiny in (0.0, 1e-300, 1e-12, 1e-5):
+        np.testing.assert_allclose(so3.quat_log(so3.quat_exp(tiny * axes())), tiny * axes(), rtol=1e-14, atol=0)
+
+
 def test_right_jacobian_has_no_step_at_its_switch() -> None:
     for switch in SWITCHES:
         below, above = (so3.right_jacobian(switch * factor * axes()) for factor in (1 - 1e-14, 1 + 1e-14))

@@ -116,7 +116,7 @@ def _jacobian(fit: ImuFit, names: tuple[str, ...], gravity: float) -> Array:
     """Return d parameters / d theta (k, p) by central differences of a smooth map; rotations through the tangent at the estimate."""
     values = parameters_of(fit.guess, fit.state.theta, gravity)
     phi = np.array([values[f"phi_g_i_{a}"] for a in "xyz"])
-    C, to_phi = so3.exp(phi), np.linalg.inv(so3.right_jacobian(phi))
+    C, to_phi = so3.exp(phi), so3.right_jacobian_inverse(phi)
     at_phi = [names.index(f"phi_g_i_{a}") for a in "xyz"]
 
     def moved(theta: Array) -> Array:

@@ -20,7 +20,7 @@ from calibkit.geometry.so3 import Array
 _REACH = 2.5  # samples to either side that the regression takes in
 _LEAST_REACH_S = 0.012
 _STEP_S = (0.0025, 0.01)  # of the grid
-_CHUNK = 65536
+_CHUNK = 4096
 _MOST_POINTS = 40_000_000  # of the grid, 90 bytes each
 _HELD = 3.5  # median intervals; the rate across a longer gap in a gyroscope's stream is not known
 
@@ -124,19 +124,17 @@ def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64], sigma:
     if t[-1] > _MOST_POINTS * step:
         raise BadInputError(f"its {len(t)} stamps span {t[-1] / 3600:.0f} h: cut it, or correct stamps that are far from the others")
     grid: Array = np.arange(int(t[-1] / step) + 1, dtype=float) * step
-    parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval) for i in range(0, len(grid), _CHUNK)]
-    fitted, rate, chain, weights = (np.concatenate(each) for each in zip(*parts, strict=True))
+    parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval, walked) for i in range(0, len(grid), _CHUNK)]
+    fitted, rate, chain, power = (np.concatenate(each) for each in zip(*parts, strict=True))
     delta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[:-1]), fitted[1:]))
-    if walked:  # what an orientation takes of each rate: of all before it
-        weights = interval * np.cumsum(weights[:, ::-1], axis=1)[:, :-1]
-    gain = float(np.sqrt(np.median(np.sum(weights**2, axis=1))))
+    gain = float(np.sqrt(np.median(power)))
     return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, gain * sigma)
 
 
 def _regress(
-    grid: Array, t: Array, q: Array, parted: NDArray[np.int64], reach: float, interval: float
+    grid: Array, t: Array, q: Array, parted: NDArray[np.int64], reach: float, interval: float, walked: bool
 ) -> tuple[Array, Array, NDArray[np.int64], Array]:
-    """Return orientation, rate and chain at the grid's instants, and what of the neighbours' orientations is in the rate, (g, k) 1/s.
+    """Return orientation, rate and chain at the grid's instants, and the rate's variance for noise of unit variance.
 
     v(s) = v0 + v1 s + v2 s^2 by least squares, v = log(q_nearest^-1 q).
     """
@@ -159,4 +157,8 @@ def _regress(
     v = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[centre])[:, None], q[near]))
     v0, v1 = np.moveaxis(rows @ v, 1, 0)
     rate = (so3.right_jacobian(v0) @ (v1 / reach)[..., None])[..., 0]
-    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[centre], -1), rows[:, 1] / reach
+    weights = rows[:, 1] / reach
+    if walked:  # what an orientation takes of each rate: of all before it
+        weights = interval * np.cumsum(weights[:, ::-1], axis=1)[:, :-1]
+    power: Array = np.sum(weights**2, axis=1)
+    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[centre], -1), power

@@ -137,7 +137,7 @@ def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -
     predicted = turned @ R.T
     tilt = -so3.hat(predicted) if len(R) == 3 else turned[:, None]
     rate = track.rate_at(stretch.t + shift)[..., None]
-    inverse = np.linalg.inv(so3.right_jacobian(turned))
+    inverse = so3.right_jacobian_inverse(turned)
     slope = R @ (inverse @ rate[stretch.turns.last] - np.swapaxes(inverse, 1, 2) @ rate[stretch.turns.first])
     left = (stretch.turns.angle[:, stretch.axes] - predicted)[..., None]
     together: Array = np.concatenate([tilt, slope, left], axis=2)

@@ -80,7 +80,7 @@ def turn_noise(turns: Turns, omega: Array, shape: Array) -> TurnNoise:
     `shape` (3,) has the variances of the axes relative to each other, for turns that do not say it.
     """
     axes = np.flatnonzero(turns.axes)
-    G: Array = np.asarray(np.linalg.inv(so3.right_jacobian(turns.angle)), np.float64)
+    G = so3.right_jacobian_inverse(turns.angle)
     own: Array = (
         turns.duration[:, None, None] * (np.diag(shape) if turns.end_cov is None else np.eye(3)) if turns.own_cov is None else turns.own_cov
     )

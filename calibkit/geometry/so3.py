@@ -56,6 +56,23 @@ def right_jacobian(v: Array) -> Array:
     return jacobian
 
 
+def right_jacobian_inverse(v: Array) -> Array:
+    """Return J_r(v)^-1 = I + hat(v)/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) hat(v)^2 (Sola 2018, eq. 144) for |v| < 2 pi, (..., 3, 3).
+
+    J_l^-1 is its transpose.
+    """
+    v = np.asarray(v, float)
+    angle2 = np.sum(v * v, axis=-1)
+    small = angle2 < 1e-2  # a wide switch: the closed form's two terms cancel as a^2
+    safe = np.where(small, 1.0, angle2)
+    half = np.sqrt(safe) / 2
+    # (1 + cos a) / sin a = cot(a / 2), which has no pole at pi.
+    third = np.where(small, 1 / 12 + angle2 / 720 + angle2**2 / 30240 + angle2**3 / 1209600, (1 - half / np.tan(half)) / safe)
+    k = hat(v)
+    inverse: Array = np.eye(3) + 0.5 * k + third[..., None, None] * (k @ k)
+    return inverse
+
+
 def to_quat(R: Array) -> Array:
     """Return unit quaternions xyzw with w >= 0 from rotation matrices (Shepperd 1978: the largest component first)."""
     R = np.asarray(R, float)

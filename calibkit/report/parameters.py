@@ -110,7 +110,7 @@ def _transform_rows(name: str, transform: Transform) -> Iterator[Row]:
     sigma: list[float | None] = [None] * 6
     if transform.covariance is not None and transform.covariance.order == list(TANGENT):
         carry = np.zeros((6, 6))
-        carry[:3, :3], carry[3:, 3:] = T[:3, :3], np.linalg.inv(so3.right_jacobian(vector))
+        carry[:3, :3], carry[3:, 3:] = T[:3, :3], so3.right_jacobian_inverse(vector)
         variance = np.diag(carry @ np.array(transform.covariance.matrix) @ carry.T)
         sigma = [float(v) for v in np.sqrt(np.maximum(variance, 0))]
     for i, axis in enumerate("xyz"):

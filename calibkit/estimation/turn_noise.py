@@ -66,6 +66,8 @@ class Whitener:
 
     def __call__(self, x: Array) -> Array:
         """Return L^-1 x for x (rows, columns)."""
+        if not x.size:  # LAPACK's wrapper writes out of bounds
+            return x
         out, _ = dtbtrs(self.factor, np.asfortranarray(x), uplo="L")
         return np.asarray(out, np.float64)
 

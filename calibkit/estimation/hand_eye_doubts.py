@@ -52,7 +52,7 @@ def suspects(fit: HandEyeFit) -> tuple[Suspect, ...]:
 
 def _guesses(fit: HandEyeFit, rows: Index) -> dict[int, str]:
     data = fit.data
-    if not fit.kept.any() or fit.Z is None:
+    if not fit.kept.any() or fit.Z is None or not data.words.Q_at_world:  # of two moving sensors there is no more to be said
         return {}
     limit = _NEAR * np.maximum(np.median(np.abs(fit.residual[fit.kept]).reshape(-1, 2, 3).max(axis=2), axis=0), 1e-6)  # m, rad
     off = se3.inverse(fit.Z) @ data.P[rows] @ fit.X @ se3.inverse(data.Q[rows])  # in world 2, the board's frame
@@ -69,7 +69,7 @@ def _guesses(fit: HandEyeFit, rows: Index) -> dict[int, str]:
         flips = [word for deg, word in _TURNS.items() if flat and abs(angle[k] - np.deg2rad(deg)) < _TURN_TOLERANCE]
         if len(other) and i not in other:
             found[int(i)] = f"it fits the pose of {_label(data, other[0])}: are poses and images paired wrongly?"
-        elif flips and data.setup != "motion":
+        elif flips:
             found[int(i)] = f"the board was read turned by {flips[0]} turn: use a board that looks the same from one side only"
         elif same:
             them = ", ".join(_label(data, j) for j in same[:3])

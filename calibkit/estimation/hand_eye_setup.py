@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.errors import BadInputError
-from calibkit.estimation.hand_eye import Settings, calibrate_hand_eye, select
+from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye, select
 from calibkit.estimation.hand_eye_data import HandEyeData
 from calibkit.estimation.hand_eye_doubts import CLEARLY, misfit
 from calibkit.geometry import se3
@@ -59,13 +59,11 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
     return Choice(setup, line, f"--setup {_SETUP_WORDS.get(other, other)}, or {better}," if other else better, times)
 
 
-def choose_pairing(problems: Mapping[str, HandEyeData]) -> tuple[str, str]:
+def choose_fit(fits: Mapping[str, HandEyeFit]) -> tuple[str, str]:
     """Return the setup whose own pairs leave far less, and how it was chosen; BadInputError where none does clearly."""
-    left = {setup: misfit(calibrate_hand_eye(_thinned(data), Settings(drift=False, methods=False))) for setup, data in problems.items()}
+    left = {setup: misfit(fit) for setup, fit in fits.items()}
     ranked = sorted(left, key=lambda setup: left[setup])
-    if len(ranked) == 1:
-        return ranked[0], ""
-    return ranked[0], _clearly(ranked, left[ranked[1]] / left[ranked[0]])
+    return ranked[0], _clearly(ranked, left[ranked[1]] / left[ranked[0]]) if len(ranked) > 1 else ""
 
 
 def _clearly(ranked: Sequence[str], times: float) -> str:

@@ -7,9 +7,12 @@ from calibkit.data.verdict import Reason, Verdict
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_doubts import Suspect
+from calibkit.estimation.hand_eye_trust import Open
 
 GOOD_POSES = 10
 _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
+_FEW_ENOUGH = 200  # poses, to name those that are wrong
+_USUAL = 0.05  # of a long stream
 _NAMED = 4
 _ANCHORS = ("park", "horaud", "daniilidis")  # that fail together only where something is wrong
 
@@ -37,10 +40,14 @@ def _open(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
     advice = "; ".join(a.text for a in fit.advice)
     out = []
     for grade, verdict in (("not observable", Verdict.FAIL), ("weak", Verdict.CHECK)):
-        those = [f"{o.text} (sigma {o.sigma:.0f} times 1 mm, 1 mrad)" if grade == "weak" else o.text for o in fit.open if o.grade == grade]
+        those = [f"{o.text}, known to {o.sigma:.2g} {_unit(o)} only" if grade == "weak" else o.text for o in fit.open if o.grade == grade]
         if those:
             out.append((verdict, f"{grade}: {'; '.join(those)}" + (f": {advice}" if advice else "")))
     return out
+
+
+def _unit(o: Open) -> str:
+    return "mm" if o.text.startswith("p ") else "mrad"
 
 
 def _doubtful(doubts: Doubts) -> list[tuple[Verdict, str]]:
@@ -71,13 +78,15 @@ def _poses(fit: HandEyeFit, wrong: tuple[Suspect, ...]) -> list[tuple[Verdict, s
     if kept < GOOD_POSES:
         text = f"{counted(kept, 'pose')} only: sigmas of so few are a guess; record {GOOD_POSES} or more, turned about two axes or more"
         out.append((Verdict.CHECK, text))
-    if wrong and n <= 1000:
-        verdict = Verdict.FAIL if len(wrong) > _MANY_WRONG * n else Verdict.CHECK
+    many = len(wrong) > _MANY_WRONG * n
+    if wrong and n <= _FEW_ENOUGH:
+        verdict = Verdict.FAIL if many else Verdict.CHECK
         named = "; ".join(f"{one_line(s.label, 60)}{f' ({s.why})' if s.why else ''}" for s in wrong[:_NAMED])
         more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
         out.append((verdict, f"{len(wrong)} of {counted(n, 'pose')} do not fit the others and are left out: {named}{more}"))
-    elif len(wrong) > _MANY_WRONG * n:
-        out.append((Verdict.FAIL, f"{len(wrong)} of {counted(n, 'pose')} do not fit the others: are both on one rigid body?"))
+    elif len(wrong) > _USUAL * n:
+        text = f"{len(wrong)} of {counted(n, 'pose')} do not fit the others and are left out, at worst {one_line(wrong[0].label, 60)}"
+        out.append((Verdict.FAIL if many else Verdict.CHECK, text + (": are both on one rigid body?" if many else "")))
     return out
 
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibkit.report.field import cells, grid, over_image, over_radius
+from calibkit.report.hand_eye_figures import cross_sections, pose_residuals, poses_in_space, rotation_axes
 from calibkit.report.imu_figures import allan, stands
 from calibkit.report.look import ACCENT, INK, PALE
 from calibkit.report.rotation_figures import rates, residual_rate
@@ -229,4 +230,20 @@ PICTURES = (
             "Windows on the line, within their bars, are good; a slope is a clock that runs fast or slow, a step is frames or stamps that "
             "were lost, and scatter beyond the bars is more than their sigma says.",
             frozenset({"window_offset", "window_sigma", "t"}), 3.6, offset_over_time),
+    Picture("pose_residuals", "Residual of each pose",
+            "About one height from pose to pose is good; a pose that stands out belongs to another image or a moved board, a slope is "
+            "a mount or a board that creeps.",
+            frozenset({"turn", "frame"}), 4.4, pose_residuals),
+    Picture("rotation_axes", "Axes of rotation",
+            "Points all over the disc are good, far turns above all; points in one place are turns about one axis, which leave the "
+            "translation along it open.",
+            frozenset({"motion"}), 3.8, rotation_axes),
+    Picture("cross_sections", "Translation, from three sides",
+            "A small round ellipse with the methods inside is good; along a long one p is known less well. A cloud in two heaps is a board "
+            "or a mount that moved.",
+            frozenset({"turn", "hand_eye"}), 3.9, cross_sections),
+    Picture("poses_in_space", "The poses in space",
+            "Cameras that look at the board from many sides, turned and tilted, are good; a wrong setup or direction of the poses shows as "
+            "cameras that look elsewhere.",
+            frozenset({"place", "rotation", "hand_eye"}), 5.2, poses_in_space),
 )  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
+from calibkit.report.hand_eye_signals import pose_shift, pose_turn, poses_dropped, second_axis
 from calibkit.report.probe import SIGNIFICANT, Measured, Probe, Signal
 from calibkit.report.time_offset_signals import over_before, rate_growth, window_scatter
 from calibkit.report.view import Array, View, given, rms
@@ -158,4 +159,12 @@ PROBES = (
     Probe("window_scatter", "scatter of the time offset between windows, over sigma", "", 2.5, inf,
           frozenset({"window_offset", "window_sigma"}), window_scatter,
           "stamps wander by more than the clock's line says: believe the time offset to that scatter, and stamp in hardware"),
+    Probe("pose_turn", "turn that the poses leave", "deg", 0.3, 3.0, frozenset({"turn"}), pose_turn,
+          "poses and images of different moments, blurred images, a robot that is not calibrated, or a board that gives"),
+    Probe("pose_shift", "shift that the poses leave", "mm", 3.0, 50.0, frozenset({"turn"}), pose_shift,
+          "poses and images of different moments, a wrong board size or lens, a robot that is not calibrated, or a board that gives"),
+    Probe("poses_dropped", "poses left out", "%", 10, 40, frozenset({"turn"}), poses_dropped,
+          "many poses do not fit the others: look at those left out"),
+    Probe("second_axis", "turn about a second axis", "deg", 8, -inf, frozenset({"motion"}), second_axis,
+          "turns about one axis leave the translation along it open: tilt the mover about another axis by 30 deg or more"),
 )  # fmt: skip

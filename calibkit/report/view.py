@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import ImuAxis, Noise
 from calibkit.errors import one_line
+from calibkit.report.hand_eye_view import HandEye, hand_eye_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 T = TypeVar("T")
 
 _ABSURD = 1e9  # in any unit: larger residuals mean nothing, and their squares would overflow
+_HUGE = 1e6  # m, rad
+_UNIT = 1e-3  # a quaternion's length from 1
 _COSTLY = 1e18  # of a chi-squared, which is a square already
 
 
@@ -65,6 +68,12 @@ class View:
     window_sigma: Array | None = None  # (n,) s
     clock: Array | None = None  # (n,) s the offset that the model of the clock has there
     bottom: Bottom | None = None  # None: there is none, or the rig says that the offset is not observable
+    turn: Array | None = None  # (n, 3) rad of a pose beside raw's m, local(Z Q, P X)
+    place: Array | None = None  # (n, 3) m, and
+    rotation: Array | None = None  # (n, 4) xyzw of T_w1_1
+    px: Array | None = None  # (n,) rms of the image's corners against the other side's pose
+    motion: Array | None = None  # (n, 3) rad, rotation vector of a pair of poses
+    hand_eye: HandEye | None = None  # the transform that these residuals are of
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
     @property
@@ -112,6 +121,12 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         if key in context:
             value = context[key].astype(float)
             good &= np.isfinite(value) & (value > 0)
+    for key in ("turn", "place", "rotation", "motion"):
+        if key in context:
+            value = context[key].astype(float)
+            good &= value.ndim == 2 and np.all(np.abs(value) < _HUGE, axis=1)
+            if key == "rotation":
+                good &= np.abs(np.linalg.norm(value, axis=1) - 1) < _UNIT
     for key in ("delay", "window_offset"):  # where to draw the row
         if key in context:
             good &= np.abs(context[key].astype(float)) < _ABSURD
@@ -175,6 +190,12 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         window_sigma=partly("window_sigma"),
         clock=partly("clock"),
         bottom=_bottom(result, residuals.sensor),
+        turn=floats("turn", 3),
+        place=floats("place", 3),
+        rotation=floats("rotation", 4),
+        px=partly("px"),
+        motion=floats("motion", 3),
+        hand_eye=hand_eye_of(result, residuals.sensor),
     )
 
 

@@ -37,11 +37,10 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     base = outputs.open()
     sides = gather(sources, base, options, progress)
     choice = _choice(sides, options)
-    data = _problem(sides, choice, options)
-    fit = calibrate_hand_eye(data)
+    fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options))
     if not fit.converged:
         raise NotConvergedError("hand-eye: the refinement did not settle: look for poses that belong to other images, or give more")
-    step = 0 if options.motions else out_of_step(data)
+    step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
     doubts = Doubts(choice.better, choice.times, length_ratio(fit), told_step(step) if step else "")
     asked = Asked(
         options.method,
@@ -60,7 +59,7 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     )
     if sides.board is not None and sides.board.lens is not None:
         result = _with_lens(result, sides.board.lens)
-    return save(result, base, outputs, sides.inputs, _told(options, data.setup))
+    return save(result, base, outputs, sides.inputs, _told(options, fit.data.setup))
 
 
 def _check(options: Options) -> None:
@@ -76,13 +75,11 @@ def _check(options: Options) -> None:
 def _choice(sides: Sides, options: Options) -> Choice:
     if options.motions:
         return Choice("motion")
-    asked = options.setup if sides.data is None else sides.data.setup
+    asked = options.setup if sides.fit is None else sides.fit.data.setup
     return choose_setup(sides.first, sides.second, asked, sides.candidates)
 
 
 def _problem(sides: Sides, choice: Choice, options: Options) -> HandEyeData:
-    if sides.data is not None:
-        return sides.data
     frames = sides.words(choice.setup)
     if options.motions:
         return of_motions(sides.first, sides.second, sides.labels, frames)

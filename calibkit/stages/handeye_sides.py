@@ -12,7 +12,7 @@ from calibkit.data.rig import Camera, TimeOffset
 from calibkit.data.verdict import Reason
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.board_poses import BoardPoses
-from calibkit.estimation.hand_eye_data import HandEyeData
+from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.geometry.so3 import Array
 from calibkit.stages.intrinsics import AUTO
 
@@ -75,14 +75,19 @@ class Sides:
     lines: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     inputs: tuple[tuple[str, str | None], ...] = ()
-    data: HandEyeData | None = None  # of streams: the problem of the setup that they were paired in
+    fit: HandEyeFit | None = None  # of streams: they are paired and fitted at once
     offsets: dict[str, TimeOffset] = field(default_factory=dict)  # of their clocks, for the rig
     reasons: tuple[Reason, ...] = ()  # about these
 
     def words(self, setup: str) -> tuple[str, str, str, str]:
         """Return the frames 1, 2, w1, w2 of a setup."""
-        one, two, w1, w2 = self.frames
-        return (w1, two, one, w2) if setup == "eye-to-hand" else (one, two, w1, w2)
+        return words(self.frames, setup)
+
+
+def words(frames: tuple[str, str, str, str], setup: str) -> tuple[str, str, str, str]:
+    """Return the frames 1, 2, w1, w2 of a setup from gripper, cam, base, target, or sensor1, sensor2, world1, world2."""
+    one, two, w1, w2 = frames
+    return (w1, two, one, w2) if setup == "eye-to-hand" else frames
 
 
 def only(board: Seen, rows: NDArray[np.intp]) -> Seen:

@@ -12,14 +12,18 @@ from calibkit.data.rig import Estimate, Rig, TimeOffset
 from calibkit.data.transforms import find_time_offset, make_time_offset
 from calibkit.data.verdict import Status, worst
 from calibkit.errors import BadInputError, one_line
-from calibkit.estimation.hand_eye_setup import SIGNS, choose_pairing
+from calibkit.estimation.hand_eye import HandEyeFit
+from calibkit.estimation.hand_eye_setup import SIGNS, choose_fit
+from calibkit.estimation.hand_eye_streams import calibrate_streams
 from calibkit.estimation.pose_interpolation import PoseStream, inverted, stream_of, stream_of_board
-from calibkit.estimation.pose_pairing import Pairing, Settings, pair_poses
+from calibkit.estimation.pose_pairing import Pairing, Settings
 from calibkit.geometry import se3
 from calibkit.io.pose_files import PoseTable
 from calibkit.io.recording import Recording
 from calibkit.solver.trust import SCALES, grade
-from calibkit.stages.handeye_sides import ROBOT, Options, Seen, Sides, arm_names, only
+from calibkit.stages.handeye_sides import ROBOT, Options, Seen, Sides, arm_names, only, words
+
+Found = tuple[Pairing, HandEyeFit]
 
 
 def two_streams(recording: Recording, rig: Rig, options: Options, progress: Progress) -> Sides:
@@ -40,9 +44,9 @@ def two_streams(recording: Recording, rig: Rig, options: Options, progress: Prog
     first = inverted(first) if options.inverse_poses else first
     second = inverted(second) if options.inverse_second else second
     frames = (*names, f"{names[0]}world", f"{names[1]}world")
-    pairing = _pair(first, second, rig, progress)
+    found = _calibrate(first, second, "motion", (frames[0], frames[1], frames[2], frames[3]), rig, progress)
     told = [f"{name} is {one_line(text.rpartition('=')[2], 100)}" for name, text in zip(names, asked, strict=True)]
-    sides = _sides(pairing, (first.name, second.name), "motion", (frames[0], frames[1], frames[2], frames[3]), ("motion",))
+    sides = _sides(found, (first.name, second.name), (frames[0], frames[1], frames[2], frames[3]), ("motion",))
     return replace(sides, lines=(", ".join(told), *sides.lines), warnings=tuple(recording.warnings), inputs=tuple(recording.inputs()))
 
 
@@ -90,62 +94,64 @@ def beside_board(
     seen = stream_of_board(board.poses)
     if not np.any(board.poses.t_ns):
         raise BadInputError(f"{recording.name}: the images have no stamps to find their poses by: give --poses FILE with one pose an image")
-    found: dict[str, Pairing] = {}
+    frames = (gripper, board.views.camera, base, "target")
+    found: dict[str, Found] = {}
     failed: list[BadInputError] = []
     for setup in [options.setup] if options.setup else ROBOT:
+        P = stream if SIGNS[setup][0] > 0 else inverted(stream)
         try:
-            found[setup] = _pair(stream if SIGNS[setup][0] > 0 else inverted(stream), seen, rig, progress)
+            found[setup] = _calibrate(P, seen, setup, words(frames, setup), rig, progress)
         except BadInputError as error:
             failed.append(error)
     if not found:
         raise failed[0]
-    setup, line = choose_pairing({key: pairing.data(key) for key, pairing in found.items()})
-    pairing = found[setup]
-    sides = _sides(pairing, (stream.name, seen.name), setup, (gripper, board.views.camera, base, "target"), ROBOT)
+    setup, line = choose_fit({key: fit for key, (_, fit) in found.items()})
+    sides = _sides(found[setup], (stream.name, seen.name), frames, ROBOT)
+    order = np.argsort(board.poses.t_ns, kind="stable")
+    rows = order[np.searchsorted(board.poses.t_ns[order], found[setup][0].t_Q_ns)]
     return replace(
         sides,
-        board=only(board, pairing.row_Q),
+        board=only(board, rows),
         lines=(*sides.lines, *([line] if line else []), *notes),
         warnings=(*recording.warnings, *board.views.warnings),
         inputs=tuple(inputs),
     )
 
 
-def _pair(P: PoseStream, Q: PoseStream, rig: Rig, progress: Progress) -> Pairing:
-    """Return the pairs, by the rig file's time offset where it has one; streams of one call are on one clock where nothing else is told."""
+def _calibrate(P: PoseStream, Q: PoseStream, setup: str, frames: tuple[str, str, str, str], rig: Rig, progress: Progress) -> Found:
+    """Return pairs and X, by the rig file's time offset where it has one; where the streams do not tell it they are on one clock."""
     known = find_time_offset(rig, P.name, Q.name)
+    settings = Settings(one_clock=True)
     if known is not None and known.value is not None:
-        return pair_poses(P, Q, Settings(known.value, known.sigma or 0.0), progress)
-    return pair_poses(P, Q, Settings(one_clock=True), progress)
+        settings = Settings(known.value, known.sigma or 0.0)
+    return calibrate_streams(P, Q, setup, settings, frames=frames, progress=progress)
 
 
-def _sides(pairing: Pairing, names: tuple[str, str], setup: str, frames: tuple[str, str, str, str], candidates: tuple[str, ...]) -> Sides:
-    sides = Sides(
-        pairing.P if SIGNS[setup][0] > 0 else se3.inverse(pairing.P),
-        pairing.Q if SIGNS[setup][1] > 0 else se3.inverse(pairing.Q),
+def _sides(found: Found, names: tuple[str, str], frames: tuple[str, str, str, str], candidates: tuple[str, ...]) -> Sides:
+    pairing, fit = found
+    signs = SIGNS[fit.data.setup]
+    return Sides(
+        pairing.P if signs[0] > 0 else se3.inverse(pairing.P),
+        pairing.Q if signs[1] > 0 else se3.inverse(pairing.Q),
         frames,
         candidates,
         pairing.labels,
-        pairing.t_ns,
+        pairing.t_P_ns,
         lines=pairing.lines,
+        fit=fit,
+        offsets=_offsets(pairing, *names),
+        reasons=pairing.reasons,
     )
-    offsets = _offsets(pairing, names)
-    return replace(sides, data=pairing.data(setup, sides.words(setup)), offsets=offsets, reasons=pairing.reasons if offsets else ())
 
 
-def _offsets(pairing: Pairing, names: tuple[str, str]) -> dict[str, TimeOffset]:
+def _offsets(pairing: Pairing, P: str, Q: str) -> dict[str, TimeOffset]:
     """Return the offset of the clocks as the rig has it, where it was estimated."""
-    fit, (P, Q) = pairing.offset.fit, names
-    if fit is None:
+    found = pairing.offset
+    status = Status(grade(found.sigma / SCALES["s"]))
+    if found.known not in ("turns", "poses") or status is Status.NOT_OBSERVABLE:
         return {}
-    to, of = (P, Q) if pairing.read_P else (Q, P)
-    status = Status(grade(fit.sigma / SCALES["s"]))
-    if status is Status.NOT_OBSERVABLE:
-        return {}
-    offset = Estimate(value=fit.td, unit="s", sigma=fit.sigma, status=status)
-    name = f"dt_{to}_{of}"
-    texts = [reason.text.removeprefix(f"{name}: ") for reason in pairing.reasons]
-    return {name: make_time_offset(to, of, offset, verdict=worst(pairing.reasons), reasons=texts)}
+    offset = Estimate(value=found.dt, unit="s", sigma=found.sigma, status=status)
+    return {f"dt_{P}_{Q}": make_time_offset(P, Q, offset, verdict=worst(pairing.reasons), reasons=[r.text for r in pairing.reasons])}
 
 
 def _samples(recording: Recording, text: str) -> PoseSamples:

@@ -134,9 +134,10 @@ def estimate_levels(noises: Sequence[TurnNoise], residuals: Sequence[Array], bia
             for noise, r, columns in zip(noises, residuals, biases, strict=True):
                 whiten = noise.whitener(levels)
                 white = whiten(np.column_stack([columns, r]))
-                root = np.linalg.qr(white).R
-                square += float(root[-1, -1] ** 2)
-                log_determinant += whiten.log_determinant + 2 * float(np.sum(np.log(np.abs(np.diag(root)[:-1]))))
+                gram = white.T @ white
+                taken = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
+                square += float(gram[-1, -1] - taken @ gram[:-1, -1])
+                log_determinant += whiten.log_determinant + float(np.linalg.slogdet(gram[:-1, :-1])[1])
         except LinAlgError:
             return np.inf, levels
         factor = max(square / n, 1e-300)

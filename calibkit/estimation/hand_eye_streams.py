@@ -10,8 +10,8 @@ from calibkit.estimation import hand_eye
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
 from calibkit.estimation.hand_eye_refine import believed, normal
 from calibkit.estimation.pose_interpolation import PoseStream
-from calibkit.estimation.pose_offset import milliseconds
-from calibkit.estimation.pose_pairing import Pairing, Settings, aligned, pair_poses
+from calibkit.estimation.pose_offset import Settings, aligned, milliseconds
+from calibkit.estimation.pose_pairing import Pairing, pair_poses
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 

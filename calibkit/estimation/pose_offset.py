@@ -8,13 +8,27 @@ from calibkit.data.observations import PoseSamples, Times
 from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Status
 from calibkit.errors import BadInputError
-from calibkit.estimation.pose_interpolation import PoseStream, without_repeats
+from calibkit.estimation.pose_interpolation import PoseStream, filled, in_time, without_repeats
 from calibkit.estimation.stamps import check_stamps
-from calibkit.estimation.time_offset import Settings, TimeOffsetFit, fit_time_offset
+from calibkit.estimation.time_offset import Settings as TurnSettings
+from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
 from calibkit.estimation.time_offset_verdict import judge_time_offset
 from calibkit.estimation.turns import turns_of_orientations
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
+
+MOST_PAIRS = 1000
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to pair."""
+
+    dt: float | None = None  # s, t_P = t_Q + dt, where it is known
+    dt_sigma: float = 0.0  # s, of a given offset
+    one_clock: bool = False  # an offset that the streams do not tell is 0
+    rests: bool | None = None  # True: rests only; False: moving pairs only; None: rests where they are as good
+    most: int = MOST_PAIRS  # moving pairs
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,40 @@ class ClockOffset:
         return f"t_{P} = t_{Q} + dt, dt = {milliseconds(self.dt, self.sigma)}, {how[self.known]}"
 
 
+@dataclass(frozen=True)
+class Streams:
+    """Two streams in time, and the offset of their clocks."""
+
+    P: PoseStream
+    Q: PoseStream
+    read_P: bool  # P is the faster one
+    offset: ClockOffset
+    lines: tuple[str, ...]
+    reasons: tuple[Reason, ...]
+
+    @property
+    def slow(self) -> PoseStream:
+        return self.Q if self.read_P else self.P
+
+    @property
+    def fast(self) -> PoseStream:
+        return self.P if self.read_P else self.Q
+
+
+def aligned(P: PoseStream, Q: PoseStream, settings: Settings, progress: Progress = silent) -> Streams:
+    """Return both streams of one rig in time, with the offset of their clocks, given, by how they turn, or 0 by one clock.
+
+    P and Q are T_w1_1 and T_w2_2 as `hand_eye_world.SETUPS` means them. BadInputError where the offset cannot be had.
+    """
+    P, Q = in_time(P), in_time(Q)
+    read_P = without_repeats(P).interval <= without_repeats(Q).interval
+    if settings.dt is not None:
+        return Streams(P, Q, read_P, ClockOffset(settings.dt, settings.dt_sigma, "given"), (), ())
+    slow, fast = (Q, P) if read_P else (P, Q)
+    offset, lines, reasons = offset_by_turns(slow, fast, read_P, settings.one_clock, progress)
+    return Streams(P, Q, read_P, offset, tuple(lines), reasons)
+
+
 def milliseconds(dt: float, sigma: float) -> str:
     """Return an offset with its sigma, in ms or, where it is long, in s."""
     text = f"{dt * 1e3:+.3f} ms" if abs(dt) < 1 else f"{dt:+.6f} s"
@@ -78,7 +126,7 @@ def offset_by_turns(
         if judged.status is not Status.NOT_OBSERVABLE:
             offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit)
             return offset, [], tuple(reason for reason in judged.reasons if f"{name}: weak:" not in reason.text)
-        why, reasons = judged.reasons[0].text.removeprefix(f"{name}: "), judged.reasons[1:]
+        why, reasons = judged.reasons[0].text.removeprefix(f"{name}: not observable: "), judged.reasons[1:]
     if not one_clock:
         raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}; or give {name} in a rig file")
     return ClockOffset(0.0, 0.0, "assumed"), [f"the poses do not tell the offset of {P.name} and {Q.name}: {why}"], reasons
@@ -87,5 +135,6 @@ def offset_by_turns(
 def _fit(slow: PoseStream, fast: PoseStream, progress: Progress) -> TimeOffsetFit:
     moves = without_repeats(slow)
     turns = turns_of_orientations(moves.t_ns, so3.to_quat(moves.T[:, :3, :3]), None if moves.cov is None else moves.cov[:, 3:, 3:])
+    fast = filled(without_repeats(fast))  # a track needs neighbours on both sides
     reference = PoseSamples(fast.t_ns, so3.to_quat(fast.T[:, :3, :3]), fast.T[:, :3, 3], "world", fast.name)
-    return fit_time_offset(turns, reference, Settings(), progress)
+    return fit_time_offset(turns, reference, TurnSettings(), progress)

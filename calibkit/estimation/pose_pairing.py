@@ -10,19 +10,17 @@ from numpy.typing import NDArray
 
 from calibkit.data.observations import Times
 from calibkit.data.plural import counted
-from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason
 from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.pose_interpolation import PoseStream, in_time, interpolate, without_repeats
-from calibkit.estimation.pose_offset import ClockOffset, offset_by_turns
+from calibkit.estimation.pose_interpolation import held, interpolate, without_repeats
+from calibkit.estimation.pose_offset import ClockOffset, Settings, Streams
 from calibkit.estimation.pose_rests import LEAST_REST_S, averaged, common_rests, distinct
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 Index = NDArray[np.intp]
 
-MOST_PAIRS = 1000
 _FEWEST = 3  # pairs
 _FEWEST_RESTS = 6
 _DISTINCT = np.radians(3.0)
@@ -30,17 +28,6 @@ _REST_SHARE = 0.5  # of the moving poses' spread that rests must hold
 _MARGIN_SIGMAS = 3.0
 _MOST_MARGIN_S = 0.1
 _PATH_STEP_S = 0.25  # turns are added up over steps as long: noise adds little
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How to pair."""
-
-    dt: float | None = None  # s, t_P = t_Q + dt, where it is known
-    dt_sigma: float = 0.0  # s, of a given offset
-    one_clock: bool = False  # an offset that the streams do not tell is 0
-    rests: bool | None = None  # True: rests only; False: moving pairs only; None: rests where they are as good
-    most: int = MOST_PAIRS  # moving pairs
 
 
 @dataclass(frozen=True)
@@ -77,40 +64,6 @@ class Pairing:
             cov_Q = cov_Q + self.extra
         t_s = None if self.kind == "rests" else self.t_s
         return HandEyeData(setup, self.P, self.Q, cov_P, cov_Q, self.labels, t_s, frames=frames)
-
-
-@dataclass(frozen=True)
-class Streams:
-    """Two streams in time, and the offset of their clocks."""
-
-    P: PoseStream
-    Q: PoseStream
-    read_P: bool  # P is the faster one
-    offset: ClockOffset
-    lines: tuple[str, ...]
-    reasons: tuple[Reason, ...]
-
-    @property
-    def slow(self) -> PoseStream:
-        return self.Q if self.read_P else self.P
-
-    @property
-    def fast(self) -> PoseStream:
-        return self.P if self.read_P else self.Q
-
-
-def aligned(P: PoseStream, Q: PoseStream, settings: Settings, progress: Progress = silent) -> Streams:
-    """Return both streams of one rig in time, with the offset of their clocks, given, by how they turn, or 0 by one clock.
-
-    P and Q are T_w1_1 and T_w2_2 as `hand_eye_world.SETUPS` means them. BadInputError where the offset cannot be had.
-    """
-    P, Q = in_time(P), in_time(Q)
-    read_P = without_repeats(P).interval <= without_repeats(Q).interval
-    if settings.dt is not None:
-        return Streams(P, Q, read_P, ClockOffset(settings.dt, settings.dt_sigma, "given"), (), ())
-    slow, fast = (Q, P) if read_P else (P, Q)
-    offset, lines, reasons = offset_by_turns(slow, fast, read_P, settings.one_clock, progress)
-    return Streams(P, Q, read_P, offset, tuple(lines), reasons)
 
 
 def pair_poses(both: Streams, settings: Settings) -> Pairing:
@@ -162,8 +115,7 @@ class _Pairs:
 
 def _moving(both: Streams, on_fast: Times, settings: Settings) -> _Pairs:
     """Return pairs at the slow stream's own stamps, evenly spread over time and turning; held poses are none."""
-    new = np.concatenate([[True], np.any(np.diff(both.slow.T, axis=0) != 0, axis=(1, 2))])
-    fast = without_repeats(both.fast)
+    new, fast = ~held(both.slow), without_repeats(both.fast)
     at = interpolate(fast, on_fast[new])
     rows = np.flatnonzero(new)
     known = np.flatnonzero(at.known)
@@ -172,8 +124,8 @@ def _moving(both: Streams, on_fast: Times, settings: Settings) -> _Pairs:
     twist = at.twist[taken]
     extra = at.curve_cov[taken] + both.offset.sigma**2 * twist[:, :, None] * twist[:, None, :]
     told = f"{len(taken)} of {counted(len(new), 'pose')} of {slow.name} are paired in motion, {fast.name} read between its stamps"
-    held, lost = len(new) - len(rows), len(rows) - len(known)
-    why = [f"{lost} lie in its gaps or outside" if lost else "", f"{held} repeat the one before" if held else ""]
+    repeated, lost = len(new) - len(rows), len(rows) - len(known)
+    why = [f"{lost} lie in its gaps or outside" if lost else "", f"{repeated} repeat the one before" if repeated else ""]
     why += [f"{len(known) - len(taken)} were thinned out" if len(taken) < len(known) else ""]
     told += "".join(f"; {text}" for text in why if text)
     cov = None if at.cov is None else at.cov[taken]

@@ -173,7 +173,8 @@ def refine(data: HandEyeData, start: Seed) -> Refined:
         z = system.apart + system.follow @ x
         left = e + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0]
         chi2 = _chi2(data, C, left, kept, system)
-        m = se3.local(M, data.Q) + ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
+        # A wrong pose is not one to adjust: its M would run away.
+        m = se3.local(M, data.Q) + kept[:, None] * ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
         X, Z, M = se3.retract(X, x), se3.retract(Z, z), se3.retract(M, m)
         e, kinds = residuals(data, X, Z, M)
         if number >= _STILL and (noise_settled or number >= _LONG) and float(x @ system.S @ x) < _SETTLED:
@@ -260,13 +261,14 @@ def _noise(data: HandEyeData, kinds: Array, theta: Array, e: Array, kept: Mask, 
     at = np.flatnonzero(system.active & kept)
     at = at[:: max(1, len(at) // _ENOUGH_FOR_NOISE)]
     kinds, e, spread = kinds[at], e[at], system.spread(data)[at]
+    W = np.linalg.inv(_sum(kinds, theta))
+    # What the fit has not taken: a share that hardly changes, and that is 0 to rounding where a kind of noise is all taken.
+    left = np.maximum(np.einsum("nij,nkji->k", W - W @ spread @ W, kinds) / np.einsum("nij,nkji->k", W, kinds), 1e-3)
     for _ in range(2):
         W = np.linalg.inv(_sum(kinds, theta))
         We = W @ e[:, :, None]
         found = np.einsum("nia,nkij,njb->k", We, kinds, We, optimize=True)
-        whole = np.einsum("nij,nkji->k", W, kinds)
-        expected = np.einsum("nij,nkji->k", W - W @ spread @ W, kinds)
-        theta = theta * found / np.maximum(expected, 1e-6 * whole) + 1e-3 * _FINEST
+        theta = theta * found / (left * np.einsum("nij,nkji->k", W, kinds)) + 1e-3 * _FINEST
     return theta
 
 

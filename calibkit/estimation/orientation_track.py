@@ -36,6 +36,7 @@ class OrientationTrack:
     chain: NDArray[np.int64]  # (g,) orientations of different chains cannot be compared; -1 where there is none
     delta: Array  # (g - 1, 3) rotation vector from each grid point to the next
     rate_sigma: Array  # (3,) rad/s, noise of the rates after smoothing
+    reach: float  # s; noise of rates is alike within it
 
     @cached_property
     def bend(self) -> Array:
@@ -128,7 +129,7 @@ def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64], sigma:
     fitted, rate, chain, power = (np.concatenate(each) for each in zip(*parts, strict=True))
     delta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[:-1]), fitted[1:]))
     gain = float(np.sqrt(np.median(power)))
-    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, gain * sigma)
+    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, gain * sigma, reach)
 
 
 def _regress(

@@ -149,11 +149,11 @@ def _jitter(t_s: Array, period: float, offset: Array) -> tuple[float, float]:
     return rms, rms / float(np.sqrt(2 * max(freedom, 1)))
 
 
-def describe(report: StampReport, noun: str = "frame") -> list[str]:
-    """Return what is wrong with the stamps, in sentences; `noun` is what has a stamp."""
+def describe(report: StampReport, noun: str = "frame", from_share: float = 0.0, from_jitter_s: float = 0.0) -> list[str]:
+    """Return what is wrong with the stamps, in sentences; `noun` is what has a stamp; both sizes are the least that is told."""
     said = []
     rate = f", the rate is {report.rate_hz:.4g} Hz" if report.rate_hz else ""
-    if report.missing:
+    if report.missing and report.missing_share >= from_share:
         said.append(f"{100 * report.missing_share:.2g} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
     if report.duplicates:
         said.append(f"{counted(report.duplicates, f'{noun} has', f'{noun}s have')} the stamp of another")
@@ -161,7 +161,7 @@ def describe(report: StampReport, noun: str = "frame") -> list[str]:
         said.append(f"{counted(report.zeros, f'{noun} has', f'{noun}s have')} a stamp of zero")
     if report.backward:
         said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time")
-    if report.period_s and report.jitter_s and report.jitter_sigma_s and report.jitter_s > _TOLD * report.period_s:
+    if report.period_s and report.jitter_s and report.jitter_sigma_s and report.jitter_s > max(_TOLD * report.period_s, from_jitter_s):
         size = f"{report.jitter_s * 1e3:.2g} +- {report.jitter_sigma_s * 1e3:.1g}"
         said.append(f"stamps jitter by {size} ms rms around a regular grid{rate if not report.missing else ''}")
     if report.bursts:

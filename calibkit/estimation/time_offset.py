@@ -39,8 +39,11 @@ _FEWEST = 20  # turns
 _CHI2_95 = 3.841
 _RIVAL = 10.83  # chi-squared of 1 in 1000: a bottom that is no more than this higher may be the true one
 _RIVAL_SHARE = 0.3  # of the stretches must be known at both lags
+_AS_LOW = 4.0  # chi-squared; the grid's own step is no reason to look again
+_AGAIN = 2
 _APART_S = 0.02  # what two starts lead to within is one bottom
 _PROFILE = 41
+_LEAST_SHARE = 1e-6  # of the information that is taken for real
 _CLOCKS = 2  # times that a clock is looked at anew
 
 
@@ -84,7 +87,7 @@ class TimeOffsetFit:
     @property
     def sigma(self) -> float:
         """Return one standard deviation, correlated residuals and noise in the reference's rates paid for."""
-        return float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, 1e-6)))
+        return float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, _LEAST_SHARE)))
 
     @property
     def depth(self) -> float:
@@ -114,27 +117,30 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
     if isinstance(reference, ImuSamples) and np.linalg.norm(bias) > _BIAS:
         a, taken_out = newton(replace(a, track=track_of_gyro(reference, bias))), bias
     a, windows = _with_clock(a, settings, reach)
+    again = 0
     while True:
         tau: Array = settings.step_s * np.arange(-round(reach / settings.step_s), round(reach / settings.step_s) + 1, dtype=float)
         cost = sweep(a, tau, progress)
         k = int(np.argmin(cost))
         inside = 2 <= k < len(tau) - 2
-        if inside and abs(tau[k] - a.tau) <= 2 * settings.step_s:
+        lower = float(np.interp(a.tau, tau, cost)) - cost[k]  # than where Gauss-Newton ended
+        if inside and (lower < _AS_LOW or (again := again + 1) > _AGAIN):
             break
-        if reach >= _MAX_REACH_S:
-            break
-        reach = min(2 * reach, _MAX_REACH_S)
+        if not inside:
+            if reach >= _MAX_REACH_S:
+                break
+            reach = min(2 * reach, _MAX_REACH_S)
         a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]))
         a, windows = _with_clock(settle(a, settings.levels), settings, reach)
     parts = columns(a)
-    covariance, interval = _trust(a, parts)
-    pretended = noise_information(a) * float(covariance.plain[0, 0]) / covariance.variance_factor
+    covariance = _covariance(a, parts)
+    noise_share = min(noise_information(a) * float(covariance.plain[0, 0]) / covariance.variance_factor, 1.0)
     fit = TimeOffsetFit(
         alignment=a,
         start=start,
         coarse_ns=start.coarse_ns,
         covariance=covariance,
-        interval=interval,
+        interval=_interval(a, covariance, noise_share),
         tau=tau,
         cost=cost,
         second=None,
@@ -143,7 +149,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         gyro_bias=taken_out + _bias(a),
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
         gain=turned_alike(a, parts) / _inflation(covariance),
-        noise_share=min(pretended, 1.0),
+        noise_share=noise_share,
     )
     return replace(fit, second=_second(fit, starts[1:]))
 
@@ -199,20 +205,25 @@ def _bias(a: Alignment) -> Array:
     return np.asarray(-a.R.T @ np.mean(found, axis=0), np.float64) if found and len(a.R) == 3 else np.zeros(3)
 
 
-def _trust(a: Alignment, parts: Sequence[Array]) -> tuple[Covariance, tuple[float, float]]:
-    """Return the covariance of tau, and the 95 % interval: where the V has risen by chi-squared's 3.84, correlation paid for."""
+def _covariance(a: Alignment, parts: Sequence[Array]) -> Covariance:
+    """Return the covariance (1, 1) of tau."""
     S, g, t = epochs(a, parts)
     rows = sum(len(X) for X in parts)
     unknowns = 1 + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)
     factor = sum(float(X[:, -1] @ X[:, -1]) for X in parts) / max(1, rows - unknowns)
-    covariance = covariance_in_time(S, g, t, factor, np.array([SCALES["s"]]))
-    rise, middle = _CHI2_95 * _inflation(covariance), a.tau
-    width = 4 * float(np.sqrt(covariance.plain[0, 0] * _inflation(covariance) / factor))
+    return covariance_in_time(S, g, t, factor, np.array([SCALES["s"]]))
+
+
+def _interval(a: Alignment, covariance: Covariance, noise_share: float) -> tuple[float, float]:
+    """Return the 95 % interval of tau: where the V has risen by chi-squared's 3.84, correlation and noise in the rates paid for."""
+    inflation = _inflation(covariance) / max(1 - noise_share, _LEAST_SHARE)
+    rise, middle = _CHI2_95 * inflation, a.tau
+    width = 4 * float(np.sqrt(covariance.plain[0, 0] * inflation / covariance.variance_factor))
     tau = middle + np.linspace(-width, width, _PROFILE)
     above = sweep(a, tau)
     above = above - above.min() - rise
     centre = int(np.argmin(above))
-    return covariance, (_crossing(tau, above, centre, -1), _crossing(tau, above, centre, 1))
+    return (_crossing(tau, above, centre, -1), _crossing(tau, above, centre, 1))
 
 
 def _crossing(x: Array, y: Array, start: int, step: int) -> float:

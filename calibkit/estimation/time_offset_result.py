@@ -87,9 +87,10 @@ def smear(rate: float, td: float, focal_px: float | None) -> str:
 def _lines(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | None, known: bool) -> list[str]:
     a, (middle, fast) = fit.alignment, rates(fit)
     duration = sum(float(part.stretch.turns.duration.sum()) for part in a.parts)
+    span = a.stretches[-1].t[-1] - a.stretches[0].t[0]
     lines = [
         f"{pair.of} ({pair.of_topic}, {pair.method}) against {pair.to} ({pair.to_topic}): {a.turns} of {fit.n_turns} turns over "
-        f"{duration:.4g} s, {middle:.2g} rad/s in the middle, {fast:.2g} at most",
+        f"{duration:.4g} of {span:.4g} s, {middle:.2g} rad/s in the middle, {fast:.2g} at most",
     ]
     if not known:
         return lines

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.estimation.alignment import columns, epochs
 from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
+from calibkit.estimation.stamps import describe as stamps_in_words
 from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import SCALES, grade
@@ -38,7 +38,8 @@ class Judged:
 def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: dict[str, StampReport]) -> Judged:
     """Return status and reasons of `name` = dt_to_of."""
     why = _not_observable(of, to, fit)
-    spoilt = [Reason(Verdict.CHECK, text) for sensor, report in stamps.items() for text in about_stamps(sensor, report)]
+    found = [(sensor, text) for sensor, report in stamps.items() for text in stamps_in_words(report, "frame", _MISSING, _JITTER_S)]
+    spoilt = [Reason(Verdict.CHECK, f"{sensor}: {text}") for sensor, text in found]
     if why:
         return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {why}"), *spoilt))
     known = grade(fit.sigma / SCALES["s"])
@@ -145,23 +146,3 @@ def _axes(of: str, fit: TimeOffsetFit) -> list[str]:
         return []
     each = ", ".join(f"{axis} {1e3 * (fit.td + d):+.2f} +- {1e3 * s:.2g}" for axis, d, s in zip("xyz", off, sigma, strict=True))
     return [f"the axes of {of} disagree: {each} ms: a rolling shutter, or poses whose errors go with the motion"]
-
-
-def about_stamps(sensor: str, report: StampReport) -> list[str]:
-    """Return what is wrong with the stamps of a sensor, with sizes."""
-    said = []
-    if report.duplicates:
-        said.append(f"{counted(report.duplicates, 'stamp repeats', 'stamps repeat')} another one; of each the first frame counts")
-    if report.zeros:
-        said.append(f"{counted(report.zeros, 'stamp is', 'stamps are')} zero, not set; those frames were left out")
-    if report.missing_share > _MISSING:
-        share = f"{100 * report.missing_share:.0f} % of the frames are missing ({report.missing} of {report.expected})"
-        said.append(share if report.rate_hz is None else f"{share}, the rate is {report.rate_hz:.4g} Hz")
-    if report.jitter_s is not None and report.jitter_s > _JITTER_S:
-        sigma = "" if report.jitter_sigma_s is None else f" +- {report.jitter_sigma_s * 1e3:.1g}"
-        said.append(f"its stamps lie {report.jitter_s * 1e3:.2g}{sigma} ms rms off a regular grid")
-    if report.bursts:
-        said.append("its stamps come in bursts: they are times of arrival; use the sensor's own clock")
-    if report.backward:
-        said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time; they were sorted")
-    return [f"{sensor}: {text}" for text in said]

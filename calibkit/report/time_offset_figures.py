@@ -15,6 +15,7 @@ from calibkit.report.view import Array, Bottom, View, given
 LIMIT = 3.84  # chi-squared of one parameter at 95 %
 FLAT = 5 * LIMIT  # a curve that stays below is drawn no taller: a flat bowl must look flat
 MAX_STEPS = 20  # that are marked
+FEWEST = 4  # windows that tell a clock's drift, as the estimator has it
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,8 @@ def _clock(panel: Axes, t: Array, clock: Array, sigma: Array, axis: Seconds) -> 
         panel.axvline(at, color=ACCENT, lw=0.9, ls="--", zorder=0)
         top, text = panel.get_xaxis_transform(), ms(float(step[end - 1]), 1e-4)
         panel.annotate(text, (at, 1), (5, -2), xycoords=top, textcoords="offset points", va="top", color=ACCENT, fontweight="bold")
+    if len(t) < FEWEST:
+        return "too few windows to tell whether the clocks drift"
     drift = "the clocks run alike" if abs(skew) < 1e-8 else f"the clocks drift apart by {1e6 * skew:+.3g} ppm"
     return drift + (f", with {counted(len(ends), 'step')} (dashed)" if len(ends) else "")
 

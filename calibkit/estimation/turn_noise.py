@@ -18,7 +18,7 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 _DECADES = range(-5, 4)  # what one kind's share may be of another's
-_ROUNDS = 2
+_ROUNDS, _SETTLED = 6, 0.1  # decades
 _WORTH_IT = 10.0  # ln likelihood that jitter must add
 _ENOUGH = 3000  # turns that tell the noise well enough
 
@@ -160,7 +160,9 @@ def estimate_levels(noises: Sequence[TurnNoise], residuals: Sequence[Array], bia
         return levels
     late = none
     for _ in range(_ROUNDS):
-        late = best(own, False)
+        before, late = (own, late), best(own, False)
         own = best(late, True)
+        if max(abs(own - before[0]), abs(late - before[1])) < _SETTLED:
+            break
     cost_late, levels_late = likelihood((own, late))
     return levels_late if cost_late < cost - _WORTH_IT else levels

@@ -165,4 +165,5 @@ def _angles_apart(data: HandEyeData) -> float:
 def told_step(step: int) -> str:
     """Return an offset in the order of the poses in words."""
     where = "after" if step > 0 else "before"
-    return f"each image fits the pose {counted(abs(step), 'row')} {where} its own far better: the files are out of step"
+    rows = counted(abs(step), "row")
+    return f"the second side's poses fit the first side's {rows} {where} their own far better: the files are out of step"

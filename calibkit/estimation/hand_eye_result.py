@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Rig, Transform
 from calibkit.data.transforms import make_transform
-from calibkit.data.verdict import Status, Verdict, worst
+from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit, Method
 from calibkit.estimation.hand_eye_doubts import Suspect, suspects
@@ -17,7 +17,7 @@ from calibkit.estimation.hand_eye_refine import SCALES
 from calibkit.estimation.hand_eye_verdict import Doubts, judge_hand_eye
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
-from calibkit.solver.trust import directions
+from calibkit.solver.trust import directions, grade
 
 STAGE = "handeye"
 REFINED = "refined"
@@ -49,6 +49,8 @@ def hand_eye_result(fit: HandEyeFit, asked: Asked) -> Result:
     entries = {name: _entry(one, two, X, fit.cov_X, cov is not None, reasons=texts, verdict=worst(reasons))}
     if fit.Z is not None and fit.cov_Z is not None:
         entries[fixed] = _entry(w1, w2, fit.Z, fit.cov_Z, chosen is None, verdict=worst(reasons))
+    if fixed in entries and entries[fixed].status is Status.NOT_OBSERVABLE:
+        reasons += (Reason(Verdict.FAIL, f"{fixed}: not observable, by the same poses"),)
     unknown = tuple(key for key, entry in entries.items() if entry.status is Status.NOT_OBSERVABLE)
     predicted = fit.predict(asked.predict) if asked.predict else None
     return Result(
@@ -137,18 +139,25 @@ def known_parts(name: str, fit: HandEyeFit) -> list[str]:
     if statuses["p"] is not Status.NOT_OBSERVABLE:
         lines.append(f"p = {_triple(1e3 * fit.X[:3, 3], 1e3 * np.sqrt(np.diag(p_cov)))} mm")
     else:
-        along = [d for d in directions(p_cov, np.full(3, SCALES[0])) if d.grade != "not observable"]
-        known = [
-            f"{1e3 * float(u @ fit.X[:3, 3]):+.2f} +- {d.sigma * 1e3 * SCALES[0]:.2g} mm along ({u[0]:.2f}, {u[1]:.2f}, {u[2]:.2f})"
-            for d in along
-            for u in [d.vector * np.sign(d.vector[np.argmax(np.abs(d.vector))])]
-        ]
-        lines.append(f"p of {name} in {one}'s axes: {'; '.join(known)}; the rest is not known" if known else f"p of {name} is not known")
+        known = _known_directions(fit.X[:3, 3], p_cov)
+        lines.append(f"p of {name}, in {one}'s axes: {'; '.join(known)}; the rest is not known" if known else f"p of {name} is not known")
     if statuses["R"] is not Status.NOT_OBSERVABLE:
         lines.append(f"R = exp{_triple(np.degrees(v), np.degrees(np.sqrt(np.diag(R_cov))))} deg")
     else:
         lines.append(f"R of {name} is not known as a whole")
     return lines
+
+
+def _known_directions(p: Array, cov: Array) -> list[str]:
+    """Return p along frame 1's axes that are known, or along the directions that are where these are no axes."""
+    along = [d.vector for d in directions(cov, np.full(3, SCALES[0])) if d.grade != "not observable"]
+    axes = [e for e in np.eye(3) if grade(float(np.sqrt(e @ cov @ e)) / SCALES[0]) != "not observable"]
+    said = []
+    for u in axes if len(axes) == len(along) else along:
+        u = u * np.sign(u[np.argmax(np.abs(u))])
+        where = "xyz"[int(np.argmax(u))] if u.max() == 1 else "({:.2f}, {:.2f}, {:.2f})".format(*(u.round(2) + 0.0))
+        said.append(f"{1e3 * float(u @ p):+.2f} +- {1e3 * float(np.sqrt(u @ cov @ u)):.2g} mm along {where}")
+    return said
 
 
 def _triple(values: Array, sigmas: Array) -> str:

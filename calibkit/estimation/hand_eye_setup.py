@@ -1,4 +1,8 @@
-"""Which way round the poses are: camera on the gripper or beside the robot, poses or their inverses, by what fits far better."""
+"""Which way round the poses are: camera on the gripper or beside the robot, poses or their inverses, by what fits far better.
+
+P X = Z Q with both sides inverted is P^-1 Z = X Q^-1, the same problem with X and Z exchanged: of the four directions of two sides only two
+can be told apart.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,14 +19,15 @@ from calibkit.geometry.so3 import Array
 _TRIED_ON = 200  # poses
 # Whether P and Q are what was recorded or their inverses (hand_eye_world.SETUPS).
 SIGNS = {"eye-in-hand": (1, -1), "eye-to-hand": (-1, -1), "motion": (1, 1)}
-_WHICH = {
-    (-1, 1): "the first side's poses the other way round (--inverse-poses)",
-    (1, -1): "the second side's poses the other way round (--inverse-second)",
-    (-1, -1): "both sides' poses the other way round (--inverse-poses --inverse-second)",
-}
-_SETUP_WORDS = {
+_WORDS = {
     "eye-in-hand": "eye-in-hand (the camera on the gripper)",
     "eye-to-hand": "eye-to-hand (the camera fixed, the board on the gripper)",
+    "motion": "motion (two sensors)",
+}
+_OTHER = {
+    "eye-in-hand": f"--setup {_WORDS['eye-to-hand']}, or the same poses the other way round (--inverse-poses),",
+    "eye-to-hand": f"--setup {_WORDS['eye-in-hand']}, or the same poses the other way round (--inverse-poses),",
+    "motion": "one side's poses the other way round (--inverse-poses or --inverse-second)",
 }
 
 
@@ -37,47 +42,43 @@ class Choice:
 
 
 def choose_setup(first: Array, second: Array, asked: str | None, candidates: Sequence[str]) -> Choice:
-    """Return the setup asked for or the candidate that leaves far less, from T_base_gripper and T_cam_target (n, 4, 4).
+    """Return the setup asked for or the one candidate that leaves far less, from T_base_gripper and T_cam_target (n, 4, 4).
 
-    Of all four directions of the two sides that one is named which fits better still. BadInputError where none does clearly.
+    BadInputError where none does clearly.
     """
-    left = {(p, q): _left(first, second, p, q) for p in (1, -1) for q in (1, -1)}
-    ranked = sorted(candidates, key=lambda setup: left[SIGNS[setup]])
-    setup, line = asked or ranked[0], ""
-    if asked is None and len(ranked) > 1:
-        line = _clearly(ranked, left[SIGNS[ranked[1]]] / left[SIGNS[setup]])
-        if set(candidates) <= set(_SETUP_WORDS):
-            line += "; with the poses the other way round (T_gripper_base) it would be the other one"
-    own = left[SIGNS[setup]]
-    best = min(left, key=lambda signs: left[signs])
-    times = own / left[best]
-    if times < CLEARLY:
-        return Choice(setup, line)
-    flips = (best[0] * SIGNS[setup][0], best[1] * SIGNS[setup][1])
-    better = _WHICH[flips]
-    other = next((name for name in candidates if SIGNS[name] == best and name != setup), None)
-    return Choice(setup, line, f"--setup {_SETUP_WORDS.get(other, other)}, or {better}," if other else better, times)
+    left = {sign: _left(first, second, sign) for sign in (1, -1)}
+    sign_of = {setup: SIGNS[setup][0] * SIGNS[setup][1] for setup in SIGNS}
+    best = 1 if left[1] < left[-1] else -1
+    times = left[-best] / left[best]
+    if asked is None:
+        able = [setup for setup in candidates if sign_of[setup] == best] if len(candidates) > 1 else list(candidates)
+        if len(candidates) > 1 and times < CLEARLY:
+            able = list(candidates)
+        if len(able) > 1:
+            raise BadInputError(f"the poses do not tell {' from '.join(able)}: give --setup {' or '.join(able)}")
+        asked = able[0]
+        if len(candidates) > 1:
+            rest = " or ".join(setup for setup in candidates if setup != asked)
+            return Choice(asked, f"{_WORDS[asked]}: it fits {times:.3g} times better than {rest}, or than poses the other way round")
+    if sign_of[asked] != best and times > CLEARLY:
+        return Choice(asked, "", _OTHER[asked], times)
+    return Choice(asked)
 
 
 def choose_fit(fits: Mapping[str, HandEyeFit]) -> tuple[str, str]:
     """Return the setup whose own pairs leave far less, and how it was chosen; BadInputError where none does clearly."""
     left = {setup: misfit(fit) for setup, fit in fits.items()}
     ranked = sorted(left, key=lambda setup: left[setup])
-    return ranked[0], _clearly(ranked, left[ranked[1]] / left[ranked[0]]) if len(ranked) > 1 else ""
-
-
-def _clearly(ranked: Sequence[str], times: float) -> str:
+    if len(ranked) == 1:
+        return ranked[0], ""
+    times = left[ranked[1]] / left[ranked[0]]
     if times < CLEARLY:
-        asked = " or ".join(ranked)
-        raise BadInputError(f"the poses do not tell {' from '.join(ranked)} ({times:.2g} times better): give --setup {asked}")
-    return f"{_SETUP_WORDS.get(ranked[0], ranked[0])}: it fits {times:.3g} times better than {ranked[1]}"
+        raise BadInputError(f"the poses do not tell {' from '.join(ranked)}: give --setup {' or '.join(ranked)}")
+    return ranked[0], f"{_WORDS[ranked[0]]}: it fits {times:.3g} times better than {ranked[1]}, or than poses the other way round"
 
 
-def _thinned(data: HandEyeData) -> HandEyeData:
-    return select(data, np.unique(np.linspace(0, len(data.P) - 1, min(len(data.P), _TRIED_ON)).round().astype(np.intp)))
-
-
-def _left(first: Array, second: Array, p: int, q: int) -> float:
-    """Return what the poses leave, each side as it is (1) or inverted (-1)."""
-    P, Q = (T if sign > 0 else se3.inverse(T) for T, sign in ((first, p), (second, q)))
-    return misfit(calibrate_hand_eye(_thinned(HandEyeData("motion", P, Q)), Settings(drift=False, methods=False)))
+def _left(first: Array, second: Array, sign: int) -> float:
+    """Return what the poses leave, the second side as it is (1) or inverted (-1)."""
+    rows = np.unique(np.linspace(0, len(first) - 1, min(len(first), _TRIED_ON)).round().astype(np.intp))
+    data = HandEyeData("motion", first, second if sign > 0 else se3.inverse(second))
+    return misfit(calibrate_hand_eye(select(data, rows), Settings(drift=False, methods=False)))

@@ -12,7 +12,6 @@ from calibkit.estimation.hand_eye_trust import Open
 GOOD_POSES = 10
 _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
 _FEW_ENOUGH = 200  # poses, to name those that are wrong
-_USUAL = 0.05  # of a long stream
 _NAMED = 4
 _ANCHORS = ("park", "horaud", "daniilidis")  # that fail together only where something is wrong
 
@@ -29,7 +28,7 @@ class Doubts:
 
 def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubts: Doubts, method: str) -> tuple[Reason, ...]:
     """Return the reasons about `name` = T_1_2, PASS where there is nothing to say."""
-    reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in (*_open(fit), *_doubtful(doubts), *_poses(fit, wrong), *_about(fit))]
+    reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in (*_doubtful(doubts), *_open(fit), *_poses(fit, wrong), *_about(fit))]
     chosen = fit.methods.get(method)
     if chosen is not None and chosen.failed:
         reasons.append(Reason(Verdict.FAIL, f"{name}: {method}, which was asked for, is far from the refined X: take --method refined"))
@@ -65,8 +64,8 @@ def _doubtful(doubts: Doubts) -> list[tuple[Verdict, str]]:
 
 
 _UNITS = (
-    (1000.0, "the first side's poses are in mm, or the board's size is given in km: check --pose-unit and the target file"),
-    (0.001, "the board's size is in mm, or the first side's poses are too small: check the target file and --pose-unit"),
+    (1000.0, "the first side's poses are in mm, or the board's size is 1000 times too small: check --pose-unit and the target file"),
+    (0.001, "the board's size is in mm, or the first side's poses are 1000 times too small: check the target file and --pose-unit"),
     (100.0, "the first side's poses are in cm: check --pose-unit"),
     (0.01, "the board's size is in cm: check the target file"),
 )
@@ -78,15 +77,11 @@ def _poses(fit: HandEyeFit, wrong: tuple[Suspect, ...]) -> list[tuple[Verdict, s
     if kept < GOOD_POSES:
         text = f"{counted(kept, 'pose')} only: sigmas of so few are a guess; record {GOOD_POSES} or more, turned about two axes or more"
         out.append((Verdict.CHECK, text))
-    many = len(wrong) > _MANY_WRONG * n
-    if wrong and n <= _FEW_ENOUGH:
-        verdict = Verdict.FAIL if many else Verdict.CHECK
+    if wrong and n <= _FEW_ENOUGH:  # of more their share is told, as a signal
+        verdict = Verdict.FAIL if len(wrong) > _MANY_WRONG * n else Verdict.CHECK
         named = "; ".join(f"{one_line(s.label, 60)}{f' ({s.why})' if s.why else ''}" for s in wrong[:_NAMED])
         more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
         out.append((verdict, f"{len(wrong)} of {counted(n, 'pose')} do not fit the others and are left out: {named}{more}"))
-    elif len(wrong) > _USUAL * n:
-        text = f"{len(wrong)} of {counted(n, 'pose')} do not fit the others and are left out, at worst {one_line(wrong[0].label, 60)}"
-        out.append((Verdict.FAIL if many else Verdict.CHECK, text + (": are both on one rigid body?" if many else "")))
     return out
 
 

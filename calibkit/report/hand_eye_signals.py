@@ -1,4 +1,4 @@
-"""The signals of a hand-eye calibration: what its poses leave over, how many were left out, how far and about what they turned (numpy only)."""
+"""The signals of a hand-eye calibration: what its poses leave over, how many were left out, how far they turned (numpy only)."""
 
 import numpy as np
 

@@ -142,7 +142,8 @@ def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
             out.append(Reason(entry.verdict, f"{part}: its stage judged it {entry.verdict.value}"))
     gone: dict[str, list[str]] = {}
     for row in rows(rig):
-        said = any("not observable" in text and text.startswith(f"{row.part}:") and row.name in text for text in heard)
+        whole = row.part in rig.transforms  # whose rows have one status
+        said = any("not observable" in text and text.startswith(f"{row.part}:") and (whole or row.name in text) for text in heard)
         if row.status is Status.NOT_OBSERVABLE and not said:
             gone.setdefault(row.part, []).append(row.name)
     out += [Reason(Verdict.FAIL, f"{part}: not observable in this recording: {', '.join(names)}") for part, names in gone.items()]

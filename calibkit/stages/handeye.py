@@ -8,6 +8,7 @@ import numpy as np
 
 from calibkit.data.progress import Progress, silent
 from calibkit.data.result import Result
+from calibkit.data.verdict import Verdict
 from calibkit.errors import BadInputError, NotConvergedError, one_line
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
@@ -36,10 +37,11 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     _check(options)
     base = outputs.open()
     sides = gather(sources, base, options, progress)
-    choice = _choice(sides, options)
-    fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options))
-    if not fit.converged:
-        raise NotConvergedError("hand-eye: the refinement did not settle: look for poses that belong to other images, or give more")
+    try:
+        choice = _choice(sides, options)
+        fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options))
+    except BadInputError as error:
+        raise BadInputError(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
     step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
     doubts = Doubts(choice.better, choice.times, length_ratio(fit), told_step(step) if step else "")
     asked = Asked(
@@ -51,6 +53,8 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
         doubts,
     )
     result = hand_eye_result(fit, asked)
+    if not fit.converged and result.verdict is not Verdict.FAIL:  # else the reasons tell why
+        raise NotConvergedError("hand-eye: the refinement did not settle: look for poses that belong to other images, or give more")
     result = replace(
         result,
         rig=result.rig.model_copy(update={"time_offsets": sides.offsets}),

@@ -227,21 +227,34 @@ def noise_information(a: Alignment) -> float:
     return total
 
 
-def epochs(a: Alignment, parts: Sequence[Array], by_axis: bool = False) -> tuple[Array, Array, Array]:
+def epochs(a: Alignment, parts: Sequence[Array]) -> tuple[Array, Array, Array]:
     """Return each stretch's information (w, 1, 1) and score (w, 1) of tau with all else eliminated, and its time (w,) s.
 
     With h = H^-1 e: X h / h_tau is tau's column without what the others explain. A shorter piece would not do: the stretch's bias is
-    fitted, so that its pieces scatter less than they are worth. `by_axis`: each turn's information and score by axis, (n, d).
+    fitted, so that its pieces scatter less than they are worth.
     """
     H = _gram(parts)[:4, :4] + np.diag(_PRIOR)
     free = np.arange(0 if a.free_rotation else 3, 4)
     h = np.zeros(4)
     h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, -1]
     columns = [X[:, :4] @ h / h[3] for X in parts]
-    scores = [u * X[:, 4] for u, X in zip(columns, parts, strict=True)]
-    if by_axis:
-        t = np.concatenate([part.stretch.middle for part in a.parts])
-        return (np.concatenate(columns) ** 2).reshape(-1, len(a.R)), np.concatenate(scores).reshape(-1, len(a.R)), t
-    t = np.array([part.stretch.middle.mean() for part in a.parts])
     information = np.array([u @ u for u in columns])
-    return information[:, None, None], np.array([each.sum() for each in scores])[:, None], t
+    score = np.array([u @ X[:, 4] for u, X in zip(columns, parts, strict=True)])
+    return information[:, None, None], score[:, None], np.array([part.stretch.middle.mean() for part in a.parts])
+
+
+def axis_offsets(a: Alignment) -> tuple[Array, Array]:
+    """Return the offset of each measured axis less tau (d,) s, and their covariance (d, d) s^2, the rotation fitted anew with them.
+
+    An axis about which nothing turns has 0 +- 1 s.
+    """
+    d = len(a.R)
+    H = np.zeros((4 + d, 4 + d))
+    for part in a.parts:
+        X = linearised(part, a.track, a.R, a.shift(part.stretch.t), by_axis=True)
+        H += X.T @ X
+    H[:-1, :-1] += np.diag([*_PRIOR[:3], *np.ones(d)])
+    free = np.arange(0 if a.free_rotation else 3, 3 + d)
+    scale = 1 / np.sqrt(np.diag(H)[free])
+    cov = np.linalg.inv(H[np.ix_(free, free)] * scale[:, None] * scale) * scale[:, None] * scale
+    return (cov @ H[free, -1])[-d:], cov[-d:, -d:]

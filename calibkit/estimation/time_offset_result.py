@@ -13,7 +13,7 @@ from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.estimation.time_offset_delay import Delays
-from calibkit.estimation.time_offset_verdict import axis_offsets, judge_time_offset, rates
+from calibkit.estimation.time_offset_verdict import by_axis, judge_time_offset, rates
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
@@ -120,7 +120,7 @@ def _facts(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
     """Return everything in SI units, for machines."""
     a, clock, (middle, fast) = fit.alignment, fit.clock, rates(fit)
     known = np.isfinite(fit.windows.sigma)
-    off, off_sigma = axis_offsets(fit)
+    off, off_cov = by_axis(fit)
     return {
         "equation": f"t_{pair.to} = t_{pair.of} + td",
         "method": pair.method,
@@ -138,7 +138,7 @@ def _facts(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
         "gyro_bias": fit.gyro_bias.tolist(),
         "stamp_jitter": float(np.sqrt(a.levels.jitter)),
         "axis_offsets": (fit.td + off).tolist(),
-        "axis_sigmas": off_sigma.tolist(),
+        "axis_sigmas": np.sqrt(np.diag(off_cov)).tolist(),
         "windows": {
             "t": ((fit.windows.start + fit.windows.stop) / 2)[known].tolist(),
             "td": (fit.coarse_ns * 1e-9 + fit.windows.tau[known]).tolist(),

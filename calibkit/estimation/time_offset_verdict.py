@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.data.verdict import Reason, Status, Verdict
-from calibkit.estimation.alignment import columns, epochs
+from calibkit.estimation.alignment import axis_offsets
 from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.stamps import describe as stamps_in_words
@@ -127,22 +127,19 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     return found
 
 
-def axis_offsets(fit: TimeOffsetFit) -> tuple[Array, Array]:
-    """Return the offset that each measured axis of the turns would have by itself, less the common one, and its sigma, (d,) s."""
-    a = fit.alignment
-    parts = columns(a)
-    S, g, _ = epochs(a, parts, by_axis=True)
-    information = S.sum(axis=0)
-    scale = float(np.sqrt(fit.covariance.corrected[0, 0] / fit.covariance.plain[0, 0])) * np.sqrt(fit.covariance.variance_factor)
-    return g.sum(axis=0) / information, scale / np.sqrt(information)
+def by_axis(fit: TimeOffsetFit) -> tuple[Array, Array]:
+    """Return the offset that each measured axis of the turns has less the common one (d,) s, and their covariance (d, d) s^2."""
+    off, cov = axis_offsets(fit.alignment)
+    return off, cov * float(fit.covariance.corrected[0, 0] / fit.covariance.plain[0, 0]) * fit.covariance.variance_factor
 
 
 def _axes(of: str, fit: TimeOffsetFit) -> list[str]:
     """Say so where the axes disagree: a rolling shutter, or poses that are wrong in a way that goes with the motion."""
-    if len(fit.alignment.R) != 3:
+    off, cov = by_axis(fit)
+    information = np.linalg.inv(cov)
+    apart = off - information.sum(axis=0) @ off / information.sum()
+    if len(off) < 2 or float(apart @ information @ apart) < _APART:
         return []
-    off, sigma = axis_offsets(fit)
-    if float(np.sum((off / sigma) ** 2)) < _APART:
-        return []
+    sigma = np.sqrt(np.diag(cov))
     each = ", ".join(f"{axis} {1e3 * (fit.td + d):+.2f} +- {1e3 * s:.2g}" for axis, d, s in zip("xyz", off, sigma, strict=True))
     return [f"the axes of {of} disagree: {each} ms: a rolling shutter, or poses whose errors go with the motion"]

@@ -126,8 +126,10 @@ def _left(stretch: Stretch, turned: Array, R: Array) -> Array:
     return np.asarray(stretch.turns.angle[:, None, stretch.axes] - turned @ R.T, np.float64)
 
 
-def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
+def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array, by_axis: bool = False) -> Array:
     """Return whitened columns (rows, 5) at one shift (m,): what rotation (3) and offset move predictions by, and the residuals.
+
+    `by_axis`: with an offset for each of the d axes that are measured, (rows, 4 + d).
 
     R -> exp(hat(d)) R moves R beta by -hat(R beta) d; of a sensor with one axis R is that axis (1, 3), free in length, and moves by d.
     d beta / d shift = J_r(beta)^-1 omega_last - J_l(beta)^-1 omega_first.
@@ -140,7 +142,7 @@ def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -
     inverse = so3.right_jacobian_inverse(turned)
     slope = R @ (inverse @ rate[stretch.turns.last] - np.swapaxes(inverse, 1, 2) @ rate[stretch.turns.first])
     left = (stretch.turns.angle[:, stretch.axes] - predicted)[..., None]
-    together: Array = np.concatenate([tilt, slope, left], axis=2)
+    together: Array = np.concatenate([tilt, slope * np.eye(len(R)) if by_axis else slope, left], axis=2)
     return part.clean(together)
 
 

@@ -16,7 +16,8 @@ from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_setup import SIGNS, choose_fit
 from calibkit.estimation.hand_eye_streams import calibrate_streams
 from calibkit.estimation.pose_interpolation import PoseStream, inverted, stream_of, stream_of_board
-from calibkit.estimation.pose_pairing import Pairing, Settings
+from calibkit.estimation.pose_offset import Settings
+from calibkit.estimation.pose_pairing import Pairing
 from calibkit.geometry import se3
 from calibkit.io.pose_files import PoseTable
 from calibkit.io.recording import Recording

@@ -70,7 +70,7 @@ def _bars(panel: Axes, values: Array, kept: "np.ndarray[tuple[int, ...], np.dtyp
     named = ", ".join(f"{labels[i]} ({good[i]:.3g})" for i in worst)
     left = f"; {counted(int(np.sum(~kept)), 'pose')} left out ({'hatched' if n <= MAX_BARS else '×'})" if not kept.all() else ""
     panel.set_title(
-        textwrap.shorten(f"rms {rms:.3g} {unit} (dashed){left}; worst: {named}", 120, placeholder=" ..."), pad=12 if len(high) else 6
+        textwrap.shorten(f"rms {rms:.3g} {unit} (dashed){left}; worst: {named}", 120, placeholder=" ..."), pad=16 if len(high) else 6
     )
 
 
@@ -123,7 +123,7 @@ def cross_sections(figure: Figure, view: View) -> None:
     if cov is not None:
         reach = max(reach, 1.2 * ELLIPSE * float(np.sqrt(np.diag(cov).max())))
     others = {name: 1e3 * (p - hand_eye.X[:3, 3]) for name, p in hand_eye.methods.items()}
-    outside = [name for name, p in others.items() if np.abs(p).max() > reach]
+    outside = [name for name, p in others.items() if np.abs(p).max() > reach]  # where p is open their distance means nothing
     axes = figure.subplots(1, 3)
     few = slice(None, None, 1 + len(kept) // MAX_POINTS)
     for panel, (i, j) in zip(axes, _SIDES, strict=True):
@@ -147,7 +147,7 @@ def cross_sections(figure: Figure, view: View) -> None:
     said = f"{hand_eye.two} in {hand_eye.one}: ({p[0]:.2f}, {p[1]:.2f}, {p[2]:.2f}) mm at the cross"
     if not hand_eye.known:
         said = f"{hand_eye.two} in {hand_eye.one}: not all of it is observable, so no ellipse is drawn"
-    far = ", ".join(f"{name} {np.linalg.norm(others[name]):.3g} mm" for name in outside)
+    far = ", ".join(f"{name} {np.linalg.norm(others[name]):.3g} mm" for name in outside if hand_eye.known)
     figure.suptitle(textwrap.fill(said + (f"; outside the picture: {far} away" if far else ""), 125), fontsize=9)
 
 

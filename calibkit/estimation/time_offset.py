@@ -123,7 +123,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         cost = sweep(a, tau, progress)
         k = int(np.argmin(cost))
         inside = 2 <= k < len(tau) - 2
-        lower = float(np.interp(a.tau, tau, cost)) - cost[k]  # than where Gauss-Newton ended
+        lower = float(sweep(a, np.array([a.tau]))[0]) - cost[k]  # than where Gauss-Newton ended; a sharp V is no straight line between
         if inside and (lower < _AS_LOW or (again := again + 1) > _AGAIN):
             break
         if not inside:

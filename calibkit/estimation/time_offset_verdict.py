@@ -23,6 +23,7 @@ _MISSING = 0.05  # of the frames
 _JITTER_S = 5e-4
 _WORSE = 3.0  # sigma over that of independent residuals
 _APART = 16.0  # chi-squared of the axes' own offsets about their mean
+_SAME_S = 1e-5  # axes may be so far apart: a gyroscope's integration leaves that at 4 rad/s, and a tenth of SCALES["s"] matters to nobody
 _GOOD_CHANGE = 4.0  # rad/s^2 rms: 1 rad/s back and forth about every axis at 0.6 Hz
 _MOTION = "turn the rig back and forth about two or more axes, 30 to 60 deg each way, once or twice a second, for 30 s"
 
@@ -136,7 +137,7 @@ def by_axis(fit: TimeOffsetFit) -> tuple[Array, Array]:
 def _axes(of: str, fit: TimeOffsetFit) -> list[str]:
     """Say so where the axes disagree: a rolling shutter, or poses that are wrong in a way that goes with the motion."""
     off, cov = by_axis(fit)
-    information = np.linalg.inv(cov)
+    information = np.linalg.inv(cov + _SAME_S**2 * np.eye(len(off)))
     apart = off - information.sum(axis=0) @ off / information.sum()
     if len(off) < 2 or float(apart @ information @ apart) < _APART:
         return []

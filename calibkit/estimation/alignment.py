@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.progress import Progress, silent
+from calibkit.errors import BadInputError
 from calibkit.estimation.clock import Clock
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.turn_comparison import (
@@ -81,6 +82,8 @@ def weighed(a: Alignment) -> Alignment:
         if keep.sum() >= LEAST_TURNS:
             kept = Stretch(stretch.turns.select(keep), stretch.origin_ns, stretch.free_bias)
             parts.append(weigh(kept, kept.noise(a.track, a.R, a.shift(kept.t), a.shape), a.levels))
+    if not parts:
+        raise BadInputError("hardly any of their turns agree: too many poses are wrong, or they come too rarely; record longer and faster")
     return replace(a, parts=tuple(parts))
 
 
@@ -114,7 +117,11 @@ def _with_levels(a: Alignment, jitter: bool) -> Alignment:
 
 
 def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
-    """Return which turns of each stretch are within chance of the fit; before the noise is known, by their median alone."""
+    """Return which turns of each stretch are within chance of the fit; before the noise is known, by their median alone.
+
+    Chance is by the median of the recording or of the stretch, whichever is larger: poses are more exact at rest, and lively turns
+    measured by quiet ones would be kept by how well they fit the offset of the moment, which biases it.
+    """
     d = len(a.R)
     biases = {part.stretch.middle[0]: raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[1] for part in a.parts}
     squares = []
@@ -127,8 +134,9 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
         left = left - stretch.turns.duration[:, None] * (np.median(rate, axis=0) if own is None else own)
         D = np.tile(np.eye(d), (len(left), 1, 1)) if robust else stretch.noise(a.track, a.R, shift, a.shape).blocks(a.levels, d)
         squares.append(np.sum(left * np.linalg.solve(D, left[..., None])[..., 0], axis=1))
-    scale = float(np.median(np.concatenate(squares))) / _MEDIAN[d]
-    return tuple(np.asarray(square <= _OUTLIER * d * scale, np.bool_) for square in squares)
+    typical = float(np.median(np.concatenate(squares)))
+    limit = _OUTLIER * d / _MEDIAN[d]
+    return tuple(np.asarray(square <= limit * max(typical, float(np.median(square))), np.bool_) for square in squares)
 
 
 def newton(a: Alignment) -> Alignment:

@@ -21,6 +21,7 @@ _REACH = 2.5  # samples to either side that the regression takes in
 _LEAST_REACH_S = 0.012
 _STEP_S = (0.0025, 0.01)  # of the grid
 _CHUNK = 4096
+_MOST = 64  # neighbours to either side
 _MOST_POINTS = 40_000_000  # of the grid, 90 bytes each
 _HELD = 3.5  # median intervals; the rate across a longer gap in a gyroscope's stream is not known
 
@@ -78,10 +79,28 @@ def track_of_gyro(samples: ImuSamples, bias: Array | None = None) -> Orientation
     t_ns, rate = samples.t_ns[order], samples.gyro[order] - (0.0 if bias is None else bias)
     if len(t_ns) < 10:
         raise BadInputError(f"{len(t_ns)} gyroscope samples are too few to follow a motion: record 10 s or more")
+    sigma = _noise(rate, 5)
+    t_ns, rate = _filled(t_ns, rate)
     h = np.diff(t_ns)[:, None] * 1e-9
     steps = h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12
     parted = np.concatenate([[0], np.cumsum(h[:, 0] > max(_HELD * float(np.median(h)), 2 * _LEAST_REACH_S))])
-    return _smooth(t_ns, accumulate(so3.quat_exp(steps)), parted, _noise(rate, 5), walked=True)
+    return _smooth(t_ns, accumulate(so3.quat_exp(steps)), parted, sigma, walked=True)
+
+
+def _filled(t_ns: NDArray[np.int64], rate: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return the samples with those that are missing put in on a straight line, where no more than two or three in a row are."""
+    h = np.diff(t_ns)
+    typical = float(np.median(h))
+    short = (h > 1.5 * typical) & (h <= max(_HELD * typical, 2e9 * _LEAST_REACH_S))
+    missing = np.where(short, np.maximum(np.rint(h / typical).astype(np.int64) - 1, 1), 0)
+    after = np.repeat(np.arange(len(h)), missing)
+    nth = np.arange(len(after)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+    f = nth / (missing[after] + 1)
+    t_new = t_ns[after] + np.rint(f * h[after]).astype(np.int64)
+    rate_new = rate[after] + f[:, None] * (rate[after + 1] - rate[after])
+    t_all, rate_all = np.concatenate([t_ns, t_new]), np.concatenate([rate, rate_new])
+    order = np.argsort(t_all, kind="stable")
+    return t_all[order], rate_all[order]
 
 
 def track_of_poses(poses: PoseSamples) -> OrientationTrack:
@@ -139,7 +158,7 @@ def _regress(
 
     v(s) = v0 + v1 s + v2 s^2 by least squares, v = log(q_nearest^-1 q).
     """
-    most = int(np.ceil(reach / interval)) + 1
+    most = min(int(np.ceil(reach / interval)) + 1, _MOST)
     centre = np.clip(np.searchsorted(t, grid), 0, len(t) - 1)
     near = centre[:, None] + np.arange(-most, most + 1)
     real = (near >= 0) & (near < len(t))

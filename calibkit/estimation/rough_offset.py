@@ -41,6 +41,8 @@ def rough_offsets(turns: Turns, track: OrientationTrack) -> list[Candidate]:
     h = float(np.clip(typical, *_STEP_S))
     fast, has_fast = _rate_of_track(track, h)
     slow, has_slow = _rate_of_turns(turns, h)
+    if not (has_fast.any() and has_slow.any()):
+        return []
     rho, n = masked_correlation(fast, has_fast, slow, has_slow)
     lags = (np.arange(len(rho)) - (len(slow) - 1)) * h
     least = max(_LEAST_OVERLAP_S, _LEAST_SHARE * h * min(has_fast.sum(), has_slow.sum()))

@@ -25,6 +25,7 @@ from calibkit.estimation.alignment import (
 )
 from calibkit.estimation.clock import Clock, fit_clock
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
+from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset_start import Start, find_starts
 from calibkit.estimation.turn_comparison import raw_residuals, split, usable
 from calibkit.estimation.turn_noise import NoiseLevels
@@ -107,6 +108,8 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
 
     BadInputError where the two share too little time. What the fit is worth is for `time_offset_verdict` to say.
     """
+    if check_stamps(reference.t_ns).bursts:
+        raise BadInputError("the stamps of the second come in bursts: they are times of arrival; record the sensor's own clock")
     track = track_of_gyro(reference) if isinstance(reference, ImuSamples) else track_of_poses(reference)
     starts = find_starts(turns, track, settings.rotation)
     if not starts:

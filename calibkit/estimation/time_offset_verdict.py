@@ -10,6 +10,7 @@ from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.stamps import describe as stamps_in_words
 from calibkit.estimation.time_offset import TimeOffsetFit
+from calibkit.estimation.turn_comparison import raw_residuals
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import SCALES, grade
 
@@ -19,6 +20,9 @@ _BOWL = 25.0  # chi-squared of the V's bottom below its sides
 _STILL = 0.02  # rad/s; slower is standing still
 _UNLIKE = 0.5  # of the turns may be left unexplained
 _LOST = 0.1  # of the turns may be outliers
+_MOSTLY_LOST = 0.5
+_CONTRARY = 1.4  # of an axis' turns is left by a prediction of the wrong sign: 2; by one that has nothing to do with it, 1
+_EXPLAINED = 0.3
 _MISSING = 0.05  # of the frames
 _JITTER_S = 5e-4
 _WORSE = 3.0  # sigma over that of independent residuals
@@ -76,6 +80,8 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
                 "or are the poses those of the world seen from the sensor (--inverse-poses)?"
             )
         return f"the rate of turn hardly changes (about {middle:.2g} rad/s): a constant rate fits every offset alike; {_MOTION}"
+    if not 1 < int(np.argmin(fit.cost)) < len(fit.cost) - 2:
+        return f"the V has no bottom within {fit.tau[-1] * 1e3:.0f} ms of {fit.td * 1e3:+.1f} ms: the two streams do not fit together"
     return ""
 
 
@@ -99,11 +105,6 @@ def _advice(fit: TimeOffsetFit) -> str:
 def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     found = []
     td = fit.td * 1e3
-    k = int(np.argmin(fit.cost))
-    if not 1 < k < len(fit.cost) - 2:
-        found.append(
-            (Verdict.FAIL, f"the V has no bottom within {fit.tau[-1] * 1e3:.0f} ms of {td:+.1f} ms: the two streams do not fit together")
-        )
     if fit.second is not None:
         text = f"{fit.second * 1e3:+.3f} ms fits as well as {td:+.3f} ms: the motion repeats itself; turn irregularly, about several axes"
         found.append((Verdict.FAIL, text))
@@ -114,18 +115,36 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
         found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, rate)]
     if fit.alignment.levels.jitter > _JITTER_S**2:
         jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
-        found.append((Verdict.CHECK, f"the stamps of {of} jitter by {jitter:.2g} ms: the residuals grow with the rate; stamp at exposure"))
-    if fit.start.unlike > _UNLIKE and fit.gain < 1e4:
+        found.append((Verdict.CHECK, f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms"))
+    if fit.start.unlike > _UNLIKE:
         found.append((Verdict.CHECK, f"{of} and {to} turn only partly alike: {100 * fit.start.unlike:.0f} % of the turns is noise"))
-    lost = 1 - fit.alignment.turns / max(fit.n_turns, 1)
+    lost = 1 - sum(int(keep.sum()) for keep in fit.alignment.keep) / max(fit.n_turns, 1)
     if lost > _LOST:
-        found.append((Verdict.CHECK, f"{100 * lost:.0f} % of the turns of {of} contradict {to} and were given up: look at its poses"))
+        verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
+        found.append((verdict, f"{100 * lost:.0f} % of the turns of {of} contradict {to} and were given up: look at its poses"))
+    if not fit.alignment.converged:
+        found.append((Verdict.FAIL, "the fit did not settle: the two streams do not fit together"))
+    found += [(Verdict.FAIL, text) for text in _contrary(of, to, fit)]
     factor = float(fit.covariance.factors[0]) * float(np.sqrt(fit.covariance.variance_factor))
     if factor > _WORSE:
         text = f"it wanders by more than its noise within the recording (sigma {factor:.1f} times that of independent residuals, paid for)"
         found.append((Verdict.CHECK, text))
     found += [(Verdict.CHECK, text) for text in _axes(of, fit)]
     return found
+
+
+def _contrary(of: str, to: str, fit: TimeOffsetFit) -> list[str]:
+    """Say which axes the prediction makes worse while it explains others: a flipped sign that no rotation makes."""
+    a = fit.alignment
+    left = np.concatenate([raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[0] for part in a.parts])
+    turned = np.concatenate([part.stretch.turns.angle - np.median(part.stretch.turns.angle, axis=0) for part in a.parts])[
+        :, a.parts[0].stretch.axes
+    ]
+    share = np.sqrt(np.mean(left**2, axis=0) / np.maximum(np.mean(turned**2, axis=0), 1e-300))
+    worse = [axis for axis, each in zip("xyz", share, strict=False) if each > _CONTRARY]
+    if len(share) < 3 or not worse or share.min() > _EXPLAINED:
+        return []
+    return [f"{' and '.join(worse)} of {of} goes against {to}, the other axes go with it: a flipped sign, or a left-handed frame"]
 
 
 def by_axis(fit: TimeOffsetFit) -> tuple[Array, Array]:

@@ -373,7 +373,8 @@ def test_motion_capture_and_camera(data_dir: Path) -> None:
         assert 0.015 < pairing.offset.dt < 0.023
         assert 2e-4 < pairing.offset.sigma < 4e-3
         assert fit.kept.mean() > 0.8
-        assert any("whole poses have" in reason.text for reason in pairing.reasons)  # turns alone say 31 ms
+    # Turns alone say 31 ms of the whole; of a half, their own sigma may be too large to contradict.
+    assert any("whole poses have" in reason.text for pairing, _ in found for reason in pairing.reasons)
     X = [fit.X for _, fit in found]
     apart = se3.local(X[0], X[1]) / np.sqrt(sum(np.diag(fit.cov_X) for _, fit in found))
     assert np.abs(apart).max() < 3

@@ -128,8 +128,8 @@ def test_no_swing_is_taken_a_period_off_in_silence() -> None:
 # What is wrong and named
 
 
-def faulty(fault: str, seed: int, speed: float = 1.0) -> tuple[Sample, TimeOffsetFit, str]:
-    sample = board_sample(camera_session(seed, any_offset(seed), speed, (fault,)))
+def faulty(fault: str, seed: int, duration_s: float = 60.0) -> tuple[Sample, TimeOffsetFit, str]:
+    sample = board_sample(camera_session(seed, any_offset(seed), faults=(fault,), duration_s=duration_s))
     fit, said = told(sample)
     assert said.status is not Status.NOT_OBSERVABLE
     return sample, fit, " | ".join(f"{reason.verdict.value}: {reason.text}" for reason in said.reasons)
@@ -206,7 +206,7 @@ def test_repeated_stamps_are_named(seeds: tuple[int, ...]) -> None:
 
 
 def test_a_stamp_that_is_not_set_is_named() -> None:
-    sample, fit, said = faulty("zero-stamp", 0)
+    sample, fit, said = faulty("zero-stamp", 0, 20.0)
     assert re.search(r"1 (stamp is|frame has a stamp of) zero", said), said
     assert abs(fit.td - sample.td) < 4 * fit.sigma < 1e-4
 
@@ -224,7 +224,7 @@ def test_stamps_that_are_seconds_late_are_an_offset_of_seconds() -> None:
 
 @pytest.mark.parametrize("fault", ["imu-gap", "image-gap", "image-stamp"])
 def test_gaps_and_one_wrong_stamp_are_survived(fault: str) -> None:
-    sample, fit, _ = faulty(fault, 1)
+    sample, fit, _ = faulty(fault, 1, 30.0)
     assert abs(fit.td - sample.td) < 4 * fit.sigma < 1e-4
 
 
@@ -297,7 +297,7 @@ def test_a_gyroscopes_scale_error_is_paid_for(seeds: tuple[int, ...]) -> None:
 
 
 def test_an_offset_beyond_the_sweep_is_found_by_correlation() -> None:
-    sample = pose_imu(path(3), 3, -123.456, 1e-3)
+    sample = pose_imu(path(3), 3, -123.456, 1e-3, 30.0)
     fit, said = told(sample)
     assert abs(fit.td - sample.td) < 4 * fit.sigma
     assert alarms(said) == []

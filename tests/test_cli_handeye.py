@@ -218,7 +218,10 @@ def test_one_axis_leaves_the_translation_along_it_open(run: Run, tmp_path: Path)
     assert "not observable: p of T_gripper_cam along the gripper's z axis" in entry.reasons[0]
     assert re.search(r"add poses tilted about the gripper's [xy] axis by 30 deg or more", entry.reasons[0])
     values = {row["name"]: row["value"] for row in json.loads(js.read_text())["parameters"] if row["part"] == "T_gripper_cam"}
-    assert set(values.values()) == {None}
+    assert {name for name, value in values.items() if value is None} == {"p_z"}
+    assert {name for name, status in entry.statuses.items() if status is Status.NOT_OBSERVABLE} == {"p_z"}
+    assert json.loads(js.read_text())["not_observable"][0] == "T_gripper_cam.p_z"
+    assert re.search(r"^T_gripper_cam p_z +not observable +m +not observable$", said.out, re.MULTILINE)
     # What is known is said all the same, and right.
     known = re.search(
         r"in gripper's axes: ([-+.\d]+) \+- ([.\d]+) mm along x; ([-+.\d]+) \+- ([.\d]+) mm along y; the rest is not known", said.out
@@ -259,9 +262,12 @@ def test_another_method_is_written_where_it_is_asked_for(run: Run, tmp_path: Pat
     said = run(*pairs.asked, "--method", "park", "-o", rig, "--json", js)
     assert said.code == 0, said
     entry = load_rig(rig).transforms["T_gripper_cam"]
-    assert entry.covariance is None
     np.testing.assert_allclose(entry.matrix, facts(js)["methods"]["park"]["X"], atol=1e-9)
-    assert "without a covariance" in said.out
+    assert_found(rig)  # its own sigmas, as honest as the refined one's
+    assert_found(rig, "T_base_target", Z, within=2e-3)
+    assert "X by park as asked for" in said.out
+    off = 1e3 * np.array(entry.matrix)[:3, 3]
+    assert f"p = ({off[0]:+.2f}" in said.out  # what is printed is what is written
 
 
 # Images, corners and streams.

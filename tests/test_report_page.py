@@ -183,8 +183,8 @@ def test_every_part_of_a_rig_is_in_the_table():
     assert len(table) == 8 + 1 + 6 + 6 + 1
     p_x = table["T_cam1_cam0", "p_x"]
     assert (p_x.value_text, p_x.sigma_text) == ("0.1000", "0.0020")  # sigma of rho_y, which R_z turns into x
-    assert table["T_cam1_cam0", "rotation vector z"].note == "90.0000 deg"
-    assert table["T_cam1_cam0", "rotation vector z"].sigma == pytest.approx(2e-4)
+    assert table["T_cam1_cam0", "r_z"].note == "90.0000 deg"
+    assert table["T_cam1_cam0", "r_z"].sigma == pytest.approx(2e-4)
     assert table["T_cam0_imu0", "p_x"].value is None
     assert (table["dt_imu0_cam0", "offset"].value_text, table["dt_imu0_cam0", "offset"].sigma_text) == ("-0.008000", "1.0e-05")
     summary = summarise(rig, [Result(stage="joint", rig=rig, reasons=())])

@@ -43,6 +43,8 @@ Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Vector4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 ImuAxis = Literal["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 IMU_AXES: tuple[ImuAxis, ...] = get_args(ImuAxis)
+TransformParameter = Literal["p_x", "p_y", "p_z", "r_x", "r_y", "r_z"]  # p_a_b in a's axes, m, and r = log R_a_b, rad
+TRANSFORM_PARAMETERS: tuple[TransformParameter, ...] = get_args(TransformParameter)
 Matrix4 = Annotated[list[Vector4], Field(min_length=4, max_length=4)]
 
 
@@ -217,6 +219,7 @@ class Transform(Record):
     inverse_matrix: Matrix4
     covariance: Covariance | None = None  # order rho_x rho_y rho_z phi_x phi_y phi_z, in b's frame
     status: Status = Status.GIVEN
+    statuses: dict[TransformParameter, Status] = {}  # each by itself; {}: all as `status`
     verdict: Verdict | None = None
     reasons: Texts = []
 
@@ -235,6 +238,10 @@ class Transform(Record):
             raise ValueError("inverse_matrix is not the inverse of matrix")
         if self.covariance is not None and len(self.covariance.order) != 6:
             raise ValueError("the covariance of a transform is 6 x 6")
+        if self.statuses and self.statuses.keys() != set(TRANSFORM_PARAMETERS):
+            raise ValueError(f"statuses must name {', '.join(TRANSFORM_PARAMETERS)}")
+        if self.statuses and (Status.NOT_OBSERVABLE in self.statuses.values()) != (self.status is Status.NOT_OBSERVABLE):
+            raise ValueError("status must be 'not observable' where one of statuses is, and only there")
         return self
 
 

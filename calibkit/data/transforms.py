@@ -37,6 +37,14 @@ def make_covariance(order: tuple[str, ...] | list[str], matrix: ArrayLike) -> Co
     return Covariance(order=list(order), matrix=((C + C.T) / 2).tolist())
 
 
+def carry_parameters(T_a_b: ArrayLike) -> Array:
+    """Return d (p_a_b, r) / d (rho, phi) of T exp(d), r = log R (6, 6): dp_a = R rho, dr = J_r(r)^-1 phi."""
+    R = np.asarray(T_a_b, float)[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = R, so3.right_jacobian_inverse(so3.log(R))
+    return out
+
+
 def make_time_offset(a: str, b: str, offset: Estimate, **more: Any) -> TimeOffset:
     """Return the rig's entry dt_a_b in s."""
     return TimeOffset(equation=f"t_{a} = t_{b} + dt_{a}_{b}", offset=offset, **more)

@@ -6,24 +6,22 @@ import numpy as np
 
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
+from calibkit.estimation.hand_eye_advice import Advice, good_poses
+from calibkit.estimation.hand_eye_compared import Method, Scatter, apart, methods_of, pairs_of, scatter
 from calibkit.estimation.hand_eye_data import HandEyeData, Index, Mask
-from calibkit.estimation.hand_eye_methods import METHODS
-from calibkit.estimation.hand_eye_pairs import Spectrum, choose_pairs, motions, spectrum
+from calibkit.estimation.hand_eye_lag import Lag, lag
+from calibkit.estimation.hand_eye_open import Open
+from calibkit.estimation.hand_eye_pairs import Spectrum, motions, spectrum
 from calibkit.estimation.hand_eye_refine import SCALES, Refined, refine
-from calibkit.estimation.hand_eye_robust import all_pairs, pairs_within, seed
-from calibkit.estimation.hand_eye_trust import Advice, Lag, Open, Trust, good_poses, judge, lag
-from calibkit.estimation.hand_eye_world import WORLD_METHODS
-from calibkit.geometry import se3, so3
+from calibkit.estimation.hand_eye_robust import seed
+from calibkit.estimation.hand_eye_trust import Trust, judge
+from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
 
-_EVERY_PAIR = 100  # poses: up to as many, all pairs
-_PAIRS = 150
 _FEWEST = 2
 _FEWEST_CHUNKS, _SHORTEST_CHUNK = 8, 5
 _TRIED_ON = 600  # poses that a chunk's length is chosen by
-_FAR_FROM = 5.0  # sigmas of the refined X, and both limits below: a closed form that is farther has failed
-_FAR_TURN, _FAR_SHIFT = np.deg2rad(0.2), 5e-3
 
 
 @dataclass(frozen=True)
@@ -33,25 +31,6 @@ class Settings:
     seed: int = 0  # of the draws
     drift: bool | None = None  # the worlds drift apart, as odometries' do; None: in `motion`, what gives the smaller sigmas
     methods: bool = True  # solve by every closed form too
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """How far P_i X Q_i^-1, which should be one transform, lies from its mean: rms over poses."""
-
-    angle: float  # rad
-    distance: float  # m
-
-
-@dataclass(frozen=True)
-class Method:
-    """What one way of solving gives, on the poses that the refinement kept."""
-
-    X: Array
-    scatter: Scatter
-    angle: float  # rad to the refined X
-    distance: float  # m
-    failed: bool  # far from the refined X by its sigmas and by more than 0.2 deg or 5 mm
 
 
 @dataclass(frozen=True)
@@ -81,8 +60,8 @@ class HandEyeFit:
     lag: Lag | None
     n_worlds: int
     converged: bool
-    _refined: Refined
-    _trust: Trust
+    refined: Refined
+    trusted: Trust
 
     @property
     def statuses(self) -> dict[str, Status]:
@@ -95,7 +74,7 @@ class HandEyeFit:
 
     def predict(self, n: int) -> Array:
         """Return the covariance of X (6, 6) that n more good poses would bring: turned by 30 deg or more about all axes."""
-        return self._trust.predict(n * good_poses(self.data, self._refined))
+        return self.trusted.predict(n * good_poses(self.data, self.refined))
 
 
 def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> HandEyeFit:
@@ -106,9 +85,9 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> H
     data = _in_chunks(data, settings)
     found, trusted = _solve(data, settings)
     X, Z = found.X, found.Z
-    pairs = _pairs(data, np.ones(len(data.P), bool))
-    good = _pairs(data, found.kept)
-    angle, distance = _apart(motions(data.P, pairs) @ X, X @ motions(data.Q, pairs))
+    pairs = pairs_of(data, np.ones(len(data.P), bool))
+    good = pairs_of(data, found.kept)
+    angle, distance = apart(motions(data.P, pairs) @ X, X @ motions(data.Q, pairs))
     one = data.n_worlds == 1
     return HandEyeFit(
         data=data,
@@ -125,7 +104,7 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> H
         pair_angle=angle,
         pair_distance=distance,
         scatter=scatter(data, X, found.kept),
-        methods=_methods(data, found, trusted.cov_X, good) if settings.methods and len(good) else {},
+        methods=methods_of(data, found, trusted.cov_X, good) if settings.methods and len(good) else {},
         noise=found.noise,
         noise_assumed=found.freedom == 0,
         spectrum=spectrum(motions(data.P, good)),
@@ -134,22 +113,9 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> H
         lag=lag(data, found, trusted.inflation),
         n_worlds=data.n_worlds,
         converged=found.converged,
-        _refined=found,
-        _trust=trusted,
+        refined=found,
+        trusted=trusted,
     )
-
-
-def scatter(data: HandEyeData, X: Array, kept: Mask) -> Scatter:
-    """Return how far P_i X Q_i^-1 of kept poses lies from the mean of its world, rms."""
-    each = (data.P @ X @ se3.inverse(data.Q))[kept]
-    if not len(each):
-        return Scatter(0.0, 0.0)
-    world = np.unique(data.world[kept], return_inverse=True)[1]
-    sums = np.zeros((int(world.max()) + 1, 4, 4))
-    np.add.at(sums, world, each)
-    mean = se3.make(so3.project(sums[:, :3, :3]), sums[:, :3, 3] / sums[:, 3, 3, None])
-    angle, distance = _apart(mean[world], each)
-    return Scatter(float(np.sqrt(np.mean(angle**2))), float(np.sqrt(np.mean(distance**2))))
 
 
 def _solve(data: HandEyeData, settings: Settings) -> tuple[Refined, Trust]:
@@ -200,37 +166,3 @@ def select(data: HandEyeData, rows: Index) -> HandEyeData:
         t_s=of(data.t_s),
         world=np.unique(data.world[rows], return_inverse=True)[1].astype(np.intp),
     )
-
-
-def _pairs(data: HandEyeData, among: Mask) -> Index:
-    """Return pairs (k, 2): all up to 100 poses, beyond that those that turn far about different axes; of many worlds within each."""
-    at = np.flatnonzero(among)
-    if data.n_worlds > 1:
-        pairs = pairs_within(data.slots)
-        return pairs[among[pairs].all(axis=1)]
-    if len(at) <= _EVERY_PAIR:
-        return at[all_pairs(len(at))]
-    some = at[:: max(1, len(at) // _PAIRS)]
-    return some[choose_pairs(data.P[some], _PAIRS)]
-
-
-def _methods(data: HandEyeData, found: Refined, cov: Array, pairs: Index) -> dict[str, Method]:
-    """Return every closed form on the poses that were kept, failures too."""
-    A, B = motions(data.P, pairs), motions(data.Q, pairs)
-    solved: dict[str, Array] = {name: method(A, B, None) for name, method in METHODS.items()}
-    if data.n_worlds == 1:
-        solved |= {name: method(data.P[found.kept], data.Q[found.kept], None)[0] for name, method in WORLD_METHODS.items()}
-    sigma_p, sigma_R = (float(np.sqrt(np.linalg.eigvalsh(cov[part, part])[-1])) for part in (slice(0, 3), slice(3, 6)))
-    out = {}
-    for name, X in solved.items():
-        angle, distance = (float(v) for v in _apart(found.X, X))
-        failed = angle > max(_FAR_TURN, _FAR_FROM * sigma_R) or distance > max(_FAR_SHIFT, _FAR_FROM * sigma_p)
-        out[name] = Method(X, scatter(data, X, found.kept), angle, distance, failed)
-    return out
-
-
-def _apart(T: Array, other: Array) -> tuple[Array, Array]:
-    """Return angle (...) rad and distance (...) m between two poses."""
-    angle: Array = np.linalg.norm(so3.log(np.swapaxes(T[..., :3, :3], -1, -2) @ other[..., :3, :3]), axis=-1)
-    distance: Array = np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1)
-    return angle, distance

@@ -8,7 +8,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.estimation import hand_eye
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
-from calibkit.estimation.hand_eye_refine import believed, normal
+from calibkit.estimation.hand_eye_lag import eliminated
 from calibkit.estimation.pose_interpolation import PoseStream
 from calibkit.estimation.pose_offset import Settings, aligned, milliseconds
 from calibkit.estimation.pose_pairing import Pairing, pair_poses
@@ -69,17 +69,8 @@ def offset_left(pairing: Pairing, fit: HandEyeFit) -> tuple[float, float, Array]
     e_i + g_i d, g = Ad(X^-1) twist where P is read and twist where Q is: least squares with x and z eliminated; the sigma is by
     blocks of two seconds, whose residuals are alike (Liang and Zeger 1986), or that of white ones if larger.
     """
-    data, found = fit.data, fit._refined
-    g = pairing.twist @ se3.adjoint(se3.inverse(found.X)).T if pairing.read_P else pairing.twist
-    system = believed(data, found.C, found.C_P, found.kept, normal(data, found.M, found.C, g, found.kept))[1]
-    x = system.cov @ system.gradient
-    z = system.apart + system.follow @ x
-    used = found.kept & system.active
-    g = (g + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0])[used]
-    W = np.linalg.solve(found.C[used], g[:, :, None])[:, :, 0]
-    tells, pull = np.sum(W * g, axis=1), np.sum(W * found.e[used], axis=1)
-    whole = max(float(tells.sum()), 1e-300)
-    change = -float(pull.sum()) / whole
-    block = (pairing.t_s[used] / _BLOCK_S).astype(np.intp)
-    scores = np.bincount(block, pull + tells * change)
-    return change, float(max(np.linalg.norm(scores) / whole, whole**-0.5)), x
+    g = pairing.twist @ se3.adjoint(se3.inverse(fit.X)).T if pairing.read_P else pairing.twist
+    column = eliminated(fit.data, fit.refined, g, fit.refined.kept)
+    block = (pairing.t_s[column.used] / _BLOCK_S).astype(np.intp)
+    scores = np.bincount(block, column.pull + column.tells * column.dt)
+    return column.dt, float(max(np.linalg.norm(scores) / column.whole, column.whole**-0.5)), column.x

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 from calibkit.data.plural import counted
-from calibkit.data.verdict import Reason, Verdict
+from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_doubts import Suspect
-from calibkit.estimation.hand_eye_trust import Open
+from calibkit.estimation.hand_eye_known import parameter_statuses
+from calibkit.estimation.hand_eye_open import Open
 
 GOOD_POSES = 10
 _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
@@ -37,11 +38,13 @@ def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubt
 
 def _open(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
     advice = "; ".join(a.text for a in fit.advice)
+    hidden = [key for key, status in parameter_statuses(fit.X, fit.cov_X).items() if status is Status.NOT_OBSERVABLE]
     out = []
     for grade, verdict in (("not observable", Verdict.FAIL), ("weak", Verdict.CHECK)):
         those = [f"{o.text}, known to {o.sigma:.2g} {_unit(o)} only" if grade == "weak" else o.text for o in fit.open if o.grade == grade]
         if those:
-            out.append((verdict, f"{grade}: {'; '.join(those)}" + (f": {advice}" if advice else "")))
+            named = f" ({', '.join(hidden)})" if grade == "not observable" else ""
+            out.append((verdict, f"{grade}: {'; '.join(those)}{named}" + (f": {advice}" if advice else "")))
     return out
 
 

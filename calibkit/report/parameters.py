@@ -6,8 +6,8 @@ from math import degrees, floor, log10
 
 import numpy as np
 
-from calibkit.data.rig import Camera, Estimate, Imu, ImuIntrinsics, Noise, Rig, TimeOffset, Transform
-from calibkit.data.transforms import TANGENT
+from calibkit.data.rig import TRANSFORM_PARAMETERS, Camera, Estimate, Imu, ImuIntrinsics, Noise, Rig, TimeOffset, Transform
+from calibkit.data.transforms import TANGENT, carry_parameters
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.geometry import so3
 from calibkit.models.noise import LETTERS
@@ -103,30 +103,20 @@ def _row(part: str, name: str, estimate: Estimate, note: str = "") -> Row:
 
 
 def _transform_rows(name: str, transform: Transform) -> Iterator[Row]:
-    """Yield translation and rotation vector v = log R, the covariance of (rho, phi) carried over: dp_a = R rho, dv = J_r(v)^-1 phi."""
+    """Yield p_a_b in a's axes and the rotation vector r = log R, each with its own status where it has one."""
     T = np.array(transform.matrix)
-    known = transform.status is not Status.NOT_OBSERVABLE
-    vector = so3.log(T[:3, :3])
+    values = [*T[:3, 3], *so3.log(T[:3, :3])]
     sigma: list[float | None] = [None] * 6
     if transform.covariance is not None and transform.covariance.order == list(TANGENT):
-        carry = np.zeros((6, 6))
-        carry[:3, :3], carry[3:, 3:] = T[:3, :3], so3.right_jacobian_inverse(vector)
+        carry = carry_parameters(T)
         variance = np.diag(carry @ np.array(transform.covariance.matrix) @ carry.T)
         sigma = [float(v) for v in np.sqrt(np.maximum(variance, 0))]
-    for i, axis in enumerate("xyz"):
-        yield Row(name, f"p_{axis}", float(T[i, 3]) if known else None, sigma[i] if known else None, None, "m", transform.status)
-    for i, axis in enumerate("xyz"):
-        value = float(vector[i])
-        yield Row(
-            name,
-            f"rotation vector {axis}",
-            value if known else None,
-            sigma[3 + i] if known else None,
-            None,
-            "rad",
-            transform.status,
-            f"{degrees(value):.4f} deg" if known else "",
-        )
+    for i, key in enumerate(TRANSFORM_PARAMETERS):
+        status = transform.statuses.get(key, transform.status)
+        known, turn = status is not Status.NOT_OBSERVABLE, i >= 3
+        value, size = (float(values[i]), sigma[i]) if known else (None, None)
+        note = f"{degrees(value):.4f} deg" if turn and value is not None else ""
+        yield Row(name, key, value, size, None, "rad" if turn else "m", status, note)
 
 
 def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
@@ -142,7 +132,7 @@ def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
             out.append(Reason(entry.verdict, f"{part}: its stage judged it {entry.verdict.value}"))
     gone: dict[str, list[str]] = {}
     for row in rows(rig):
-        whole = row.part in rig.transforms  # whose rows have one status
+        whole = row.part in rig.transforms  # whose reasons name directions
         said = any("not observable" in text and text.startswith(f"{row.part}:") and (whole or row.name in text) for text in heard)
         if row.status is Status.NOT_OBSERVABLE and not said:
             gone.setdefault(row.part, []).append(row.name)

@@ -11,11 +11,12 @@ from calibkit.data.result import Result
 from calibkit.data.verdict import Verdict
 from calibkit.errors import BadInputError, NotConvergedError, one_line
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
+from calibkit.estimation.hand_eye_asked import REFINED, Asked
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
 from calibkit.estimation.hand_eye_doubts import length_ratio, out_of_step, told_step
 from calibkit.estimation.hand_eye_methods import METHODS
 from calibkit.estimation.hand_eye_pixels import corner_rms
-from calibkit.estimation.hand_eye_result import REFINED, Asked, hand_eye_result
+from calibkit.estimation.hand_eye_result import hand_eye_result
 from calibkit.estimation.hand_eye_setup import SIGNS, Choice, choose_setup
 from calibkit.estimation.hand_eye_verdict import Doubts
 from calibkit.estimation.hand_eye_world import WORLD_METHODS

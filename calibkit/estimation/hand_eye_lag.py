@@ -1,0 +1,75 @@
+"""A time offset between the two sides: what the residuals say of one, with X and every Z following it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.estimation.hand_eye_data import HandEyeData, Mask
+from calibkit.estimation.hand_eye_refine import Refined, believed, normal
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+
+_LAG_SIGMAS = 5.0
+_NEIGHBOURS = 0.5  # s, between whose poses there is a velocity
+_FEWEST = 10  # poses with a velocity
+
+
+@dataclass(frozen=True)
+class Lag:
+    """dt_1_2, t_1 = t_2 + dt_1_2, that the residuals call for: they grow with speed."""
+
+    dt: float  # s
+    sigma: float
+    share: float  # of chi-squared that it explains
+
+
+@dataclass(frozen=True)
+class Column:
+    """What remains of d e / d dt once X and the worlds have followed: least squares of e + column dt."""
+
+    used: Mask  # (n,)
+    tells: Array  # (k,) g^T C^-1 g of the k poses used, g what remains: the information about dt
+    pull: Array  # (k,) g^T C^-1 e
+    x: Array  # (6,) d x / d dt, in X's right tangent
+
+    @property
+    def whole(self) -> float:
+        return max(float(self.tells.sum()), 1e-300)
+
+    @property
+    def dt(self) -> float:
+        return -float(self.pull.sum()) / self.whole
+
+
+def eliminated(data: HandEyeData, fit: Refined, g: Array, rows: Mask) -> Column:
+    """Return the column g (n, 6) of e, in those rows, with x and z eliminated."""
+    system = believed(data, fit.C, fit.C_P, rows, normal(data, fit.M, fit.C, g, rows))[1]
+    x = system.cov @ system.gradient
+    z = system.apart + system.follow @ x
+    used = rows & system.active
+    left = (g + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0])[used]
+    weighed = np.linalg.solve(fit.C[used], left[:, :, None])[:, :, 0]
+    return Column(used, np.sum(weighed * left, axis=1), np.sum(weighed * fit.e[used], axis=1), x)
+
+
+def lag(data: HandEyeData, fit: Refined, inflation: float) -> Lag | None:
+    """Return the time offset that the residuals show, where they do by five sigmas.
+
+    P stamped dt early is P(t) = P(t + dt) exp(-v dt): e gains -v dt, v the twist of M in its right tangent.
+    """
+    if data.t_s is None:
+        return None
+    order = np.lexsort([data.t_s, data.world])
+    before, here, after = order[:-2], order[1:-1], order[2:]
+    span = data.t_s[after] - data.t_s[before]
+    near = (span > 0) & (span < 2 * _NEIGHBOURS) & (data.world[before] == data.world[after]) & fit.kept[before] & fit.kept[after]
+    v, known = np.zeros((len(data.P), 6)), np.zeros(len(data.P), bool)
+    v[here[near]] = se3.local(fit.M[before[near]], fit.M[after[near]]) / span[near, None]
+    known[here[near]] = True
+    known &= fit.kept
+    if known.sum() < _FEWEST:
+        return None
+    column = eliminated(data, fit, v, known)
+    sigma = float(np.sqrt(inflation / column.whole))
+    share = column.dt**2 * column.whole / max(float(np.sum(fit.chi2[column.used])), 1e-300)
+    return Lag(column.dt, sigma, share) if abs(column.dt) > _LAG_SIGMAS * sigma else None

@@ -11,8 +11,9 @@ from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye
 from calibkit.estimation.hand_eye_data import WORDS, HandEyeData, of_motions, of_recording
 from calibkit.estimation.hand_eye_methods import METHODS
+from calibkit.estimation.hand_eye_normal import normal
 from calibkit.estimation.hand_eye_pairs import motions
-from calibkit.estimation.hand_eye_refine import normal, residuals
+from calibkit.estimation.hand_eye_refine import residuals
 from calibkit.estimation.hand_eye_robust import all_pairs
 from calibkit.estimation.hand_eye_world import SETUPS
 from calibkit.geometry import se3, so3

@@ -9,10 +9,14 @@ from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye_advice import Advice, good_poses
 from calibkit.estimation.hand_eye_compared import Method, Scatter, apart, methods_of, pairs_of, scatter
 from calibkit.estimation.hand_eye_data import HandEyeData, Index, Mask
+from calibkit.estimation.hand_eye_images import Corners
 from calibkit.estimation.hand_eye_lag import Lag, lag
-from calibkit.estimation.hand_eye_open import Open
+from calibkit.estimation.hand_eye_lens import LensEffect, lens_effect
+from calibkit.estimation.hand_eye_noise import RobotNoise
+from calibkit.estimation.hand_eye_normal import SCALES, believed, normal
+from calibkit.estimation.hand_eye_open import Open, open_directions
 from calibkit.estimation.hand_eye_pairs import Spectrum, motions, spectrum
-from calibkit.estimation.hand_eye_refine import SCALES, Refined, refine
+from calibkit.estimation.hand_eye_refine import Refined, refine
 from calibkit.estimation.hand_eye_robust import seed
 from calibkit.estimation.hand_eye_trust import Trust, judge
 from calibkit.geometry import se3
@@ -31,6 +35,7 @@ class Settings:
     seed: int = 0  # of the draws
     drift: bool | None = None  # the worlds drift apart, as odometries' do; None: in `motion`, what gives the smaller sigmas
     methods: bool = True  # solve by every closed form too
+    robot: RobotNoise | None = None  # the arm's noise; None: told by the residuals
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,8 @@ class HandEyeFit:
     lag: Lag | None
     n_worlds: int
     converged: bool
+    by_reach: bool  # an arm's turns and places contradict each other: its geometry is off, and places count less
+    lens: LensEffect | None  # of corners: how well the lens is known, and how X follows it
     refined: Refined
     trusted: Trust
 
@@ -77,13 +84,16 @@ class HandEyeFit:
         return self.trusted.predict(n * good_poses(self.data, self.refined))
 
 
-def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> HandEyeFit:
-    """Return X with its covariance; BadInputError with fewer than two poses in any world."""
+def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None, corners: Corners | None = None) -> HandEyeFit:
+    """Return X with its covariance; BadInputError with fewer than two poses in any world.
+
+    With each pose's corners, a robot's X is that of the least reprojection error, the robot's own noise beside it.
+    """
     settings = settings or Settings()
     if data.n_worlds == 0 or np.bincount(data.world, minlength=data.n_worlds).min() < _FEWEST:
         raise BadInputError(f"hand-eye needs two poses at least and has {len(data.P)}: record 10 or more, turned about two axes or more")
     data = _in_chunks(data, settings)
-    found, trusted = _solve(data, settings)
+    found, trusted, lens = _solve(data, settings, corners)
     X, Z = found.X, found.Z
     pairs = pairs_of(data, np.ones(len(data.P), bool))
     good = pairs_of(data, found.kept)
@@ -113,14 +123,34 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None) -> H
         lag=lag(data, found, trusted.inflation),
         n_worlds=data.n_worlds,
         converged=found.converged,
+        by_reach=found.by_reach,
+        lens=lens,
         refined=found,
         trusted=trusted,
     )
 
 
-def _solve(data: HandEyeData, settings: Settings) -> tuple[Refined, Trust]:
-    found = refine(data, seed(data, np.random.default_rng(settings.seed)))
-    return found, judge(data, found)
+def _solve(data: HandEyeData, settings: Settings, corners: Corners | None = None) -> tuple[Refined, Trust, LensEffect | None]:
+    """Return the optimum and how far it may be trusted; what is not known of the lens is in X's and Z's covariance."""
+    found = refine(data, seed(data, np.random.default_rng(settings.seed)), corners, settings.robot)
+    trusted = judge(data, found)
+    if found.corners is None or found.sight is None:
+        return found, trusted, None
+    system = believed(data, found.C, found.C_P, found.kept, normal(data, found.M, found.C, found.e, found.kept))[1]
+    variance = found.noise["Q_factor"] ** 2
+    lens = lens_effect(data, system, found.M, found.C, found.e, found.kept, found.corners, found.sight, variance)
+    if lens is None:
+        return found, trusted, None
+    cov_X = trusted.cov_X + lens.of_X(lens.cov)
+    trusted = replace(
+        trusted,
+        cov_X=cov_X,
+        plain_X=trusted.plain_X + lens.of_X(lens.plain),
+        cov_Z=trusted.cov_Z + lens.of_Z(lens.cov),
+        plain_Z=trusted.plain_Z + lens.of_Z(lens.plain),
+        open=open_directions(data, found.X, cov_X),
+    )
+    return found, trusted, lens
 
 
 def _in_chunks(data: HandEyeData, settings: Settings) -> HandEyeData:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.hand_eye_refine import SCALES, Refined
+from calibkit.estimation.hand_eye_normal import SCALES
+from calibkit.estimation.hand_eye_refine import Refined
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust

@@ -5,7 +5,7 @@ import numpy as np
 from calibkit.data.rig import TRANSFORM_PARAMETERS, TransformParameter
 from calibkit.data.transforms import carry_parameters
 from calibkit.data.verdict import Status
-from calibkit.estimation.hand_eye_refine import SCALES
+from calibkit.estimation.hand_eye_normal import SCALES
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import WEAK, directions, grade
 

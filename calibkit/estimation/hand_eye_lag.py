@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.estimation.hand_eye_data import HandEyeData, Mask
-from calibkit.estimation.hand_eye_refine import Refined, believed, normal
+from calibkit.estimation.hand_eye_normal import believed, normal
+from calibkit.estimation.hand_eye_refine import Refined
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 

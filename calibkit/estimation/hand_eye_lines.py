@@ -10,8 +10,8 @@ from calibkit.estimation.hand_eye_asked import REFINED, Asked
 from calibkit.estimation.hand_eye_compared import scatter
 from calibkit.estimation.hand_eye_doubts import Suspect
 from calibkit.estimation.hand_eye_known import position_covariance
+from calibkit.estimation.hand_eye_normal import SCALES
 from calibkit.estimation.hand_eye_redrawn import DRAWS
-from calibkit.estimation.hand_eye_refine import SCALES
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import directions, grade

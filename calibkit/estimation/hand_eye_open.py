@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.hand_eye_refine import SCALES
+from calibkit.estimation.hand_eye_normal import SCALES
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
 

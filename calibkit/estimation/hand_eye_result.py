@@ -14,8 +14,8 @@ from calibkit.estimation.hand_eye_doubts import suspects
 from calibkit.estimation.hand_eye_facts import facts
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.hand_eye_lines import lines, methods_table
+from calibkit.estimation.hand_eye_normal import SCALES
 from calibkit.estimation.hand_eye_redrawn import by_closed_form
-from calibkit.estimation.hand_eye_refine import SCALES
 from calibkit.estimation.hand_eye_verdict import judge_hand_eye
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array

@@ -6,8 +6,9 @@ import numpy as np
 
 from calibkit.estimation.hand_eye_advice import Advice, advise, with_more
 from calibkit.estimation.hand_eye_data import HandEyeData
+from calibkit.estimation.hand_eye_normal import SCALES, Normal, believed, normal
 from calibkit.estimation.hand_eye_open import Open, open_directions
-from calibkit.estimation.hand_eye_refine import SCALES, Normal, Refined, believed, normal
+from calibkit.estimation.hand_eye_refine import Refined
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
 

@@ -1,0 +1,116 @@
+"""The normal equations of a hand-eye problem, e = -x + Ad(M^-1) z with noise of covariance C, and what of x they really tell."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibkit.estimation.hand_eye_data import HandEyeData, Mask
+from calibkit.geometry import se3, so3
+from calibkit.geometry.so3 import Array
+from calibkit.solver import trust
+
+SCALES = np.array([trust.SCALES["m"]] * 3 + [trust.SCALES["rad"]] * 3)  # what X must be known to
+ENOUGH_FOR_NOISE = 1000  # poses: sigmas to 1 %
+_FAR = np.array([100.0] * 3 + [10.0] * 3) ** -2.0  # information before any: nothing is farther than 100 m and 10 rad
+_NOTHING = 1e-8  # information in 1 mm and 1 mrad: of what is known to 10 m and 10 rad
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations with the worlds eliminated: S is the information about X."""
+
+    S: Array  # (6, 6)
+    gradient: Array  # (6,)
+    A: Array  # (n_worlds, 6, 6) information about each Z given X
+    follow: Array  # (n_worlds, 6, 6) d z_w / d x
+    apart: Array  # (n_worlds, 6) z_w for x = 0
+    J_Z: Array  # (n, 6, 6) Ad(M^-1)
+    J_X: Array  # (n, 6, 6) d e_i / d x with z_w following
+    active: Mask  # (n,) whose world has two kept poses or more
+    free: Array  # (6, k) directions of x that the poses tell of, orthonormal in SCALES; the others stay as they are
+
+    @property
+    def cov(self) -> Array:
+        """The covariance of x along what is free."""
+        out: Array = self.free @ np.linalg.inv(self.free.T @ self.S @ self.free) @ self.free.T
+        return out
+
+    @property
+    def held(self) -> Array:
+        """The other directions (6, 6 - k)."""
+        out: Array = SCALES[:, None] * np.linalg.svd(self.free / SCALES[:, None])[0][:, self.free.shape[1] :]
+        return out
+
+    def spread_parts(self, data: HandEyeData) -> tuple[Array, Array]:
+        """Return the covariance (n, 6, 6) of the fitted e_i, by z_w given x and by x."""
+        by_world = self.J_Z @ np.linalg.inv(self.A)[data.world] @ np.swapaxes(self.J_Z, 1, 2)
+        return by_world, self.J_X @ self.cov @ np.swapaxes(self.J_X, 1, 2)
+
+    def spread(self, data: HandEyeData) -> Array:
+        """Return their sum."""
+        by_world, by_X = self.spread_parts(data)
+        out: Array = by_world + by_X
+        return out
+
+    def respond(self, data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> tuple[Array, Array, Array]:
+        """Return x (6,) and z (n_worlds, 6) that answer to e (n, 6), and what is left of it, under these equations' C and kept."""
+        of_e = normal(data, M, C, e, kept)
+        x: Array = self.cov @ of_e.gradient
+        z: Array = of_e.apart + of_e.follow @ x
+        left: Array = e + x - (self.J_Z @ z[data.world][:, :, None])[:, :, 0]
+        return x, z, left
+
+
+def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Normal:
+    """Return the normal equations of e = -x + Ad(M^-1) z.
+
+    A world with fewer than two kept poses says nothing of X; its Z is that of all its poses.
+    """
+    W, J_Z = np.linalg.inv(C), se3.adjoint(se3.inverse(M))
+    active = (np.bincount(data.world, kept, data.n_worlds) >= 2)[data.world]
+    JW = np.swapaxes(J_Z, 1, 2) @ W * (kept | ~active)[:, None, None]
+    A = _by_world(data, JW @ J_Z) + np.diag(_FAR)
+    right = _by_world(data, np.concatenate([JW, (JW @ e[:, :, None])], axis=2))
+    solved = np.asarray(np.linalg.solve(A, right), np.float64)
+    follow, apart = solved[:, :, :6], solved[:, :, 6]
+    J_X = J_Z @ follow[data.world] - np.eye(6)
+    RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
+    left = e - (J_Z @ apart[data.world][:, :, None])[:, :, 0]
+    S = np.sum(RW @ J_X, axis=0) + np.diag(_FAR)
+    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, active, np.zeros((6, 0)))
+
+
+def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal, chance: bool = True) -> tuple[Array, Normal]:
+    """Return X's covariance (6, 6) by what the noise in the adjusted poses has not made, and the system with what is free.
+
+    A pose's error d ~ D moves Ad(M) to Ad(M) (I + ad(d)): poses at rest would have sum E[ad(d)^T C^-1 ad(d)] of information. What is more
+    than that, and than chance can add (Davidson and Szarek 2001, as in hand_eye_pairs.Spectrum.rank), is knowledge.
+    """
+    used = np.flatnonzero(kept & system.active)
+    worlds = len(np.unique(data.world[used]))
+    some = used[:: max(1, len(used) // ENOUGH_FOR_NOISE)]
+    W = np.linalg.inv(C[some])
+    D = C_P[some] @ W @ (C - C_P)[some]
+    values, vectors = np.linalg.eigh((D + np.swapaxes(D, 1, 2)) / 2)
+    roots = np.swapaxes(vectors * np.sqrt(np.maximum(values, 0))[:, None, :], 1, 2)
+    ad = np.zeros((*roots.shape, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = so3.hat(roots[..., 3:])
+    ad[..., :3, 3:] = so3.hat(roots[..., :3])
+    by_chance = np.einsum("nkai,nab,nkbj->ij", ad, W, ad, optimize=True) * len(used) / max(len(some), 1)
+    units = SCALES[:, None] * SCALES
+    if chance:
+        by_chance = by_chance * (1 + (np.sqrt(2) + 3) / np.sqrt(max(len(used) - worlds, 1))) ** 2
+    values, vectors = np.linalg.eigh((system.S - by_chance) * units)
+    whole = np.einsum("ij,ik,kj->j", vectors, system.S * units, vectors)
+    empty = values < np.maximum(whole / 2, max(_NOTHING, _ROUNDING * values[-1]))
+    back = vectors * SCALES[:, None]
+    return back / np.where(empty, _NOTHING, values) @ back.T, replace(system, free=vectors[:, ~empty] * SCALES[:, None])
+
+
+def _by_world(data: HandEyeData, values: Array) -> Array:
+    if data.n_worlds == 1:
+        return np.asarray(values.sum(axis=0, keepdims=True))
+    out = np.zeros((data.n_worlds, *values.shape[1:]))
+    np.add.at(out, data.world, values)
+    return out

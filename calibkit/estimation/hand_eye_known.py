@@ -10,7 +10,6 @@ from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import WEAK, directions, grade
 
 _ORDER = (Status.DETERMINED, Status.WEAK, Status.NOT_OBSERVABLE)
-_SHARE = WEAK / np.sqrt(6)  # in the scales: a direction that is not observable moves one of six parameters as far
 _TURN = 0.01  # of a direction of unit length: less is no turn
 
 
@@ -46,12 +45,14 @@ def parameter_statuses(X: Array, cov: Array) -> dict[TransformParameter, Status]
     carry = carry_parameters(X)
     both = carry @ cov @ carry.T
     hidden = carry @ open_covariance(cov) @ carry.T
-    both[:3, :3] = position_covariance(X, cov)
-    hidden[:3, :3] += both[:3, :3] - X[:3, :3] @ cov[:3, :3] @ X[:3, :3].T
+    circle = position_covariance(X, cov) - both[:3, :3]
+    both[:3, :3] += circle
+    hidden[:3, :3] += circle
     sigma, share = (np.sqrt(np.maximum(np.diag(C), 0)) / SCALES for C in (both, hidden))
     share[3:] = share[3:].max()
+    limit = WEAK if share.max() > WEAK else WEAK / np.sqrt(6)  # one of six parameters moves at least as far
     worst = _ORDER.index(Status(directions(cov, SCALES)[0].grade))
     found = {}
     for key, of, by in zip(TRANSFORM_PARAMETERS, sigma, share, strict=True):
-        found[key] = Status.NOT_OBSERVABLE if by > _SHARE else _ORDER[min(_ORDER.index(Status(grade(float(of)))), worst, 1)]
+        found[key] = Status.NOT_OBSERVABLE if by > limit else _ORDER[min(_ORDER.index(Status(grade(float(of)))), worst, 1)]
     return found

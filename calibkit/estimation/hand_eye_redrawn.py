@@ -14,7 +14,7 @@ from calibkit.estimation.hand_eye_pairs import motions
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
-DRAWS = 200  # sigmas to 5 %
+DRAWS = 100  # sigmas to 7 %
 _FLOOR = 1e-10  # variance of rounding, m^2 and rad^2: what no noise moves is known to 10 um and 10 urad
 
 

@@ -1,9 +1,11 @@
 """td over time: a constant clock is not taken for another, drifts and jumps are found with honest sigmas, and said in words."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from time_offset_samples import path, pose_imu
 
 from calibkit.estimation.clock import Clock, describe, fit_clock
 
@@ -185,3 +187,27 @@ def test_words() -> None:
     worse = _clock(360, 60, 5e-5, 0, scatter=lambda rng, w: 2 * rng.normal(size=w))
     assert worse.scatter == pytest.approx(2, rel=0.15)
     assert describe(worse)[-1] == f"td of the windows scatters {worse.scatter:.1f} times as much as their sigmas say"
+
+
+def test_frames_that_a_driver_lost_are_found_to_the_frame() -> None:
+    """Stamps counted on at 20 Hz: each lost frame makes them late by 50 ms more, in all further than the V reaches; and they drift."""
+    sample = pose_imu(path(0), 0, 0.0123, 1e-3, 60.0)
+    t_ns = sample.turns.t_ns
+    since = (t_ns - t_ns[0]) * 1e-9
+    late = 20e-6 * since + 0.05 * (since >= 20) + 0.05 * (since >= 42)
+    stamps = t_ns + np.round(late * 1e9).astype(np.int64)
+    fit = replace(sample, turns=replace(sample.turns, t_ns=stamps)).fitted
+    clock, a = fit.clock, fit.alignment
+    assert clock is not None
+    assert clock.kind == "jumping"
+    t = (stamps + fit.coarse_ns - a.track.origin_ns) * 1e-9
+    lost = np.flatnonzero(np.diff(since >= 20) | np.diff(since >= 42))
+    assert len(clock.jumps) == 2
+    for jump, k in zip(clock.jumps, lost, strict=True):
+        assert jump.size_s == pytest.approx(-0.05, abs=4 * jump.sigma_s)
+        assert t[k] < jump.t_s < t[k + 1]
+        assert jump.t_sigma_s < 0.05
+    wrong = fit.coarse_ns * 1e-9 + a.shift(t) - (0.0123 - late)
+    assert np.abs(wrong).max() < 4 * (fit.sigma + 30 * clock.skew_sigma + sum(jump.sigma_s for jump in clock.jumps))
+    assert fit.sigma < 5e-5  # as without them
+    assert a.turns > 0.99 * fit.n_turns

@@ -35,6 +35,7 @@ _PRIOR = np.array([TILT**-2, TILT**-2, TILT**-2, 0.0])
 _LONGEST_STEP_S = 0.05
 _WINDOW_STEP_S = 0.002
 _WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
+_FURTHEST_S = 0.8  # that a stretch's own bottom is looked for
 _DRAWS = 8
 _SLAB = 2_000_000  # numbers held at once
 
@@ -186,7 +187,10 @@ def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
 
 
 def window_offsets(a: Alignment, reach: float) -> Windows:
-    """Return the offset of each part by itself: the bottom of its own V within `reach`, where it has one, then Gauss-Newton."""
+    """Return the offset of each part by itself: the bottom of its own V, where it has one, then Gauss-Newton.
+
+    It is looked for within `reach`, and further where it lies at the edge: a clock that jumps leaves whole stretches far from the others.
+    """
     found = [_window(a, part, reach) for part in a.parts]
     rows = np.array([row for row in found if row is not None], float).reshape(-1, 4)
     return Windows(*(rows[:, k] for k in range(4)))
@@ -194,11 +198,17 @@ def window_offsets(a: Alignment, reach: float) -> Windows:
 
 def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, float, float] | None:
     stretch = part.stretch
-    grid = np.arange(-reach, reach + _WINDOW_STEP_S / 2, _WINDOW_STEP_S)
     base = a.shift(stretch.t)
+    grid = np.arange(-reach, reach + _WINDOW_STEP_S / 2, _WINDOW_STEP_S)
+    grid = grid[(stretch.t[0] + base[0] + grid >= 0) & (stretch.t[-1] + base[-1] + grid <= a.track.step * (len(a.track.q) - 1))]
+    if len(grid) < 3:
+        return None
     cost = np.sum(residuals(part, a.track, a.R, base[:, None] + grid) ** 2, axis=0)
     k = int(np.argmin(cost))
-    if not 0 < k < len(grid) - 1 or min(cost[:k].max(), cost[k + 1 :].max()) - cost[k] < _WINDOW_DEPTH:
+    if not 0 < k < len(grid) - 1:
+        further = min(2 * reach, _FURTHEST_S)
+        return _window(a, part, further) if further > reach and np.ptp(cost) > _WINDOW_DEPTH else None
+    if min(cost[:k].max(), cost[k + 1 :].max()) - cost[k] < _WINDOW_DEPTH:
         return None
     extra, information = float(grid[k]), 0.0
     for _ in range(3):

@@ -24,6 +24,7 @@ from calibkit.estimation.alignment import (
     window_offsets,
 )
 from calibkit.estimation.clock import Clock, fit_clock
+from calibkit.estimation.clock_jumps import placed
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset_start import Start, find_starts
@@ -45,7 +46,7 @@ _AGAIN = 2
 _APART_S = 0.02  # what two starts lead to within is one bottom
 _PROFILE = 41
 _LEAST_SHARE = 1e-6  # of the information that is taken for real
-_CLOCKS = 2  # times that a clock is looked at anew
+_CLOCKS = 4  # times that a clock is looked at
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
     a, windows = _with_clock(a, settings, reach)
     again = 0
     while True:
-        tau: Array = settings.step_s * np.arange(-round(reach / settings.step_s), round(reach / settings.step_s) + 1, dtype=float)
+        tau = _grid(a, settings.step_s, reach)
         cost = sweep(a, tau, progress)
         k = int(np.argmin(cost))
         inside = 2 <= k < len(tau) - 2
@@ -133,7 +134,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
             if reach >= _MAX_REACH_S:
                 break
             reach = min(2 * reach, _MAX_REACH_S)
-        a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]))
+        a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]), clock=a.clock)
         a, windows = _with_clock(settle(a, settings.levels), settings, reach)
     parts = columns(a)
     covariance = _covariance(a, parts)
@@ -188,18 +189,33 @@ def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settin
 
 
 def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignment, Windows]:
-    """Return the alignment with the drift and the jumps that its windows show, and the windows."""
+    """Return the alignment with the drift and the jumps that its windows show, and the windows.
+
+    What a moving clock leaves is noise to a constant one, so that outliers and levels are found anew with it, and once more if it
+    changes by more than a window knows.
+    """
     windows = window_offsets(a, reach)
     for _ in range(_CLOCKS):
         if not len(windows.tau):
-            return a, windows
-        clock = fit_clock((windows.start + windows.stop) / 2, windows.start, windows.stop, windows.tau, windows.sigma)
-        constant = clock.kind == "constant"
-        if constant and (a.clock is None or a.clock.kind == "constant"):
+            break
+        middle = (windows.start + windows.stop) / 2
+        clock = placed(a, fit_clock(middle, windows.start, windows.stop, windows.tau, windows.sigma))
+        if clock.kind == "constant" and (a.clock is None or a.clock.kind == "constant"):
             return replace(a, clock=clock), windows
-        a = settle(replace(a, clock=clock, tau=clock.offset_s), settings.levels)
+        change = np.abs(clock.at(middle) - a.shift(middle))
+        a = replace(a, clock=clock, tau=clock.offset_s)
+        if float(change.max()) < float(np.median(windows.sigma)):
+            return newton(a), windows
+        a = settle(a, settings.levels)
         windows = window_offsets(a, reach)
     return a, windows
+
+
+def _grid(a: Alignment, step: float, reach: float) -> Array:
+    """Return the offsets (k,) of the V: around the start, or where a clock that moves has left that, around its reference time's."""
+    moves = a.clock is not None and a.clock.kind != "constant"
+    many, middle = round(reach / step), round(a.tau / step) if moves else 0
+    return np.asarray(step * np.arange(middle - many, middle + many + 1), np.float64)
 
 
 def _bias(a: Alignment) -> Array:

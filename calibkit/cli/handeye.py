@@ -56,6 +56,18 @@ def run(
     method: Annotated[
         str, typer.Option("--method", help="refined, or write the X of tsai, park, horaud, andreff, daniilidis, shah or li.")
     ] = "refined",
+    robot_noise: Annotated[
+        str,
+        typer.Option(
+            "--robot-noise",
+            metavar="MM,DEG",
+            help="Sigmas of the robot's poses, per coordinate, where you know them (0.1,0.02); auto: told by the residuals; exact: none, "
+            "the reprojection error alone decides, which a robot that is not pays for with an X that is wrong by much more than its sigma.",
+        ),
+    ] = "auto",
+    free_intrinsics: Annotated[
+        bool, typer.Option("--free-intrinsics", help="Estimate the lens together with X, and write it over the rig's; images only.")
+    ] = False,
     predict: Annotated[int, typer.Option("--predict", metavar="N", help="Tell the sigma that N more good poses would bring.")] = 0,
     model: Annotated[str, typer.Option("--model", help="Of a lens that no rig file has, and is calibrated on the way.")] = "auto",
     resolution: options.Resolution = None,
@@ -93,6 +105,8 @@ def run(
         setup=setup,
         predict=predict,
         method=method,
+        robot_noise=robot_noise,
+        free_intrinsics=free_intrinsics,
         cache=not no_cache,
         ros_distro=ros_distro,
     )

@@ -83,6 +83,14 @@ class Corners:
         limit = OUTLIER * np.array([max(scale_of_norms(row[seen]), 1.0) for row, seen in zip(size, left.seen, strict=True)])
         return replace(self, grid=replace(self.grid, weight=np.where(left.seen & (size <= limit[:, None]), self.found, 0.0)))
 
+    def rms(self, M: Array) -> tuple[float, float]:
+        """Return the rms px of the corners that take part and of all found ones, at poses M."""
+        out = []
+        for weight in (self.grid.weight, self.found):
+            left = CameraProblem(self.points, (replace(self.grid, weight=weight),)).residuals(self._state(M), 0)
+            out.append(float(np.sqrt(np.sum(left.px**2) / max(int(left.seen.sum()), 1))))
+        return out[0], out[1]
+
     def _state(self, M: Array) -> LensState:
         return LensState((self.lens,), np.eye(4)[None], se3.inverse(M))
 

@@ -12,7 +12,7 @@ from calibkit.geometry.so3 import Array
 ASSUMED_SIGMAS = (1e-3, 1e-3)  # rad, m: where the poses are too few to tell
 _FACTORS = (1.0, 3.0)  # that a given covariance may be too small by: what corners err by together is not in it
 _FEWEST = 3  # poses whose residuals tell of noise
-_CHANCE = 1e-3  # of arms with white noise are taken for others, at the price of wider sigmas
+_CHANCE = 1e-2  # of arms with white noise are taken for others: that costs accuracy, to miss one costs honesty
 _SAME = 1e-3
 _FINEST = 1e-14  # variance: nothing is known to better than 0.1 urad and 0.1 um
 

@@ -24,7 +24,7 @@ from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
 _WRONG = 1e-4  # of the good poses lie beyond the limit
-_MAX_STEPS = 40
+_MAX_STEPS = 80
 _STILL = 2  # steps without X: what the measured poses' noise tells is not yet told from knowledge
 _SETTLED = 1e-4  # sigmas squared
 _LONG = 12  # steps: what two sides share of the noise may creep for ever, and says little of X

@@ -10,7 +10,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.data.result import Result
 from calibkit.data.verdict import Verdict
 from calibkit.errors import BadInputError, NotConvergedError, one_line
-from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
+from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye
 from calibkit.estimation.hand_eye_asked import REFINED, Asked
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
 from calibkit.estimation.hand_eye_doubts import length_ratio, out_of_step, told_step
@@ -22,6 +22,7 @@ from calibkit.estimation.hand_eye_verdict import Doubts
 from calibkit.estimation.hand_eye_world import WORLD_METHODS
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
+from calibkit.stages.handeye_images import check, corners, freed, how, robot_noise, with_images
 from calibkit.stages.handeye_poses import gather
 from calibkit.stages.handeye_sides import Options, Sides
 from calibkit.stages.outputs import Outputs, Saved, save
@@ -40,7 +41,8 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     sides = gather(sources, base, options, progress)
     try:
         choice = _choice(sides, options)
-        fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options))
+        seen = corners(sides, base, options)
+        fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options), Settings(robot=robot_noise(options.robot_noise)), seen)
     except BadInputError as error:
         raise BadInputError(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
     step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
@@ -50,7 +52,7 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
         options.predict,
         None if sides.t_ns is None or options.motions else sides.t_ns,
         _pixels(sides, fit),
-        (*sides.lines, *([choice.line] if choice.line else [])),
+        (*sides.lines, *([choice.line] if choice.line else []), *how(fit)),
         doubts,
     )
     result = hand_eye_result(fit, asked)
@@ -64,6 +66,7 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     )
     if sides.board is not None and sides.board.lens is not None:
         result = _with_lens(result, sides.board.lens)
+    result = with_images(result, fit, sides, options)
     return save(result, base, outputs, sides.inputs, _told(options, fit.data.setup))
 
 
@@ -75,6 +78,7 @@ def _check(options: Options) -> None:
         raise BadInputError(f"--setup {one_line(options.setup)}: choose one of {', '.join(SIGNS)}")
     if not 0 <= options.predict <= MAX_PREDICTED:
         raise BadInputError(f"--predict {options.predict}: give 0 to {MAX_PREDICTED}")
+    check(options)
 
 
 def _choice(sides: Sides, options: Options) -> Choice:
@@ -97,7 +101,7 @@ def _pixels(sides: Sides, fit: HandEyeFit) -> Array | None:
     if sides.board is None or fit.Z is None:
         return None
     T_cam_board = se3.inverse(fit.X) @ se3.inverse(fit.data.P) @ fit.Z  # Q = Z^-1 P X is T_board_cam
-    return corner_rms(sides.board.views, sides.board.poses, sides.board.camera, T_cam_board)
+    return corner_rms(sides.board.views, sides.board.poses, freed(fit, sides.board.camera), T_cam_board)
 
 
 def _with_lens(result: Result, lens: Result) -> Result:
@@ -131,4 +135,6 @@ def _told(options: Options, setup: str) -> dict[str, str | float | int | bool | 
         "motions": options.motions,
         "target": None if options.target is None else options.target.name,
         "predict": options.predict,
+        "robot_noise": options.robot_noise,
+        "free_intrinsics": options.free_intrinsics,
     }

@@ -42,6 +42,8 @@ class Options:
     setup: str | None = None
     predict: int = 0
     method: str = "refined"
+    robot_noise: str = "auto"  # exact, or sigmas of a coordinate in mm and deg
+    free_intrinsics: bool = False
     cache: bool = True
     ros_distro: str | None = None
 

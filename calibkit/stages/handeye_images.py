@@ -1,0 +1,155 @@
+"""What `calibkit handeye` makes of corners and of a robot's stated noise: the refinement in the images, and a lens that is free."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy import special
+
+from calibkit.data.result import Result
+from calibkit.data.rig import Camera, Estimate, Reprojection, Rig
+from calibkit.data.transforms import make_covariance
+from calibkit.data.verdict import Reason, Status, Verdict, worst
+from calibkit.errors import BadInputError, one_line
+from calibkit.estimation.hand_eye import HandEyeFit
+from calibkit.estimation.hand_eye_images import Corners, corners_of
+from calibkit.estimation.hand_eye_lens import LensEffect
+from calibkit.estimation.hand_eye_noise import RobotNoise
+from calibkit.estimation.lens_trust import pixel_effect
+from calibkit.models.cameras import CAMERAS
+from calibkit.solver.trust import grade
+from calibkit.stages.handeye_sides import Options, Sides
+
+AUTO, EXACT = "auto", "exact"
+_NOT_EXACT = 3.0  # times the corners' noise
+_CHANCE = 1e-3  # of lenses that have not moved are told to have
+
+
+def robot_noise(text: str) -> RobotNoise | None:
+    """Return what `--robot-noise` says; None of auto."""
+    if text == AUTO:
+        return None
+    if text == EXACT:
+        return RobotNoise(0.0, 0.0)
+    try:
+        mm, deg = (float(part) for part in text.split(","))
+    except ValueError:
+        mm = deg = math.nan
+    if not (0 < mm < 1e3 and 0 < deg < 90):
+        raise BadInputError(f"--robot-noise {one_line(text)}: write auto, exact, or MM,DEG, sigmas of a coordinate, such as 0.1,0.02")
+    return RobotNoise(math.radians(deg), 1e-3 * mm)
+
+
+def check(options: Options) -> None:
+    """Raise BadInputError for options that need a robot or corners and have none."""
+    robot_noise(options.robot_noise)
+    if options.free_intrinsics and (options.target is None or options.poses is None):
+        raise BadInputError("--free-intrinsics needs images of a board, with --target and a robot's --poses")
+    if options.robot_noise != AUTO and (options.motions or options.setup == "motion"):
+        raise BadInputError("--robot-noise is for a robot's poses: leave it out of --setup motion")
+
+
+def corners(sides: Sides, base: Rig, options: Options) -> Corners | None:
+    """Return the corners of one image a pose; None of streams, whose poses are read between their stamps."""
+    if sides.board is None or sides.fit is not None:
+        if options.free_intrinsics or (options.robot_noise != AUTO and sides.fit is not None):
+            raise BadInputError("--free-intrinsics and --robot-noise need one image for each of a robot's poses, no streams")
+        return None
+    board = sides.board
+    own = {digest for _, digest in sides.inputs if digest is not None}
+    same = board.lens is not None or any(file.sha256 in own for run in base.provenance for file in run.inputs)
+    return corners_of(board.views, board.poses, board.camera, options.free_intrinsics, same)
+
+
+def how(fit: HandEyeFit) -> list[str]:
+    """Return in lines how X was refined."""
+    found = fit.refined.corners
+    lines = []
+    if found is not None:
+        used, seen, rms = int(np.sum(found.grid.weight > 0)), int(np.sum(found.found > 0)), found.rms(fit.refined.M)[0]
+        lens = "free" if found.free else "held, its covariance in X's" if fit.lens else "held"
+        lines.append(f"refined in the images: {used} of {seen} corners, rms {rms:.3g} px, the lens {lens}")
+    if fit.by_reach:
+        lines.append("the robot's places and turns contradict each other (its errors depend on its pose): places count for less")
+    return lines
+
+
+def with_images(result: Result, fit: HandEyeFit, sides: Sides, options: Options) -> Result:
+    """Return the result with what refining in the images has shown, and the camera's entry where the lens was free, as asked for."""
+    found, robot, reasons = fit.refined.corners, robot_noise(options.robot_noise), list(result.reasons)
+    facts: dict[str, object] = {"robot_noise": options.robot_noise, "by_reach": fit.by_reach, "in_images": found is not None}
+    if found is not None:
+        used, rms = int(np.sum(found.grid.weight > 0)), found.rms(fit.refined.M)[0]
+        facts |= {"corners": used, "rms_px": rms, "free_intrinsics": found.free}
+    noise = fit.noise.get("Q_factor", 0.0)
+    if robot is not None and robot.exact and noise > _NOT_EXACT:
+        text = f"with exact robot poses the corners are off by {noise:.2g} times their noise: this robot's poses are not exact"
+        reasons.append(Reason(Verdict.CHECK, f"{text}; leave out --robot-noise exact"))
+    result = replace(result, reasons=tuple(reasons), facts={**result.facts, "refinement": facts})
+    if found is None or not found.free or fit.lens is None or sides.board is None:
+        return result
+    return _with_free_lens(result, fit, found, fit.lens, sides.board.views.camera, sides.board.camera)
+
+
+def freed(fit: HandEyeFit, camera: Camera) -> Camera:
+    """Return the camera as the refinement has it."""
+    found = fit.refined.corners
+    if found is None or not found.free:
+        return camera
+    names = CAMERAS[camera.model].parameter_names
+    return camera.model_copy(
+        update={"parameters": {name: Estimate(value=float(v)) for name, v in zip(names, found.lens, strict=True)}, "covariance": None}
+    )
+
+
+def _with_free_lens(result: Result, fit: HandEyeFit, found: Corners, lens: LensEffect, name: str, camera: Camera) -> Result:
+    names = CAMERAS[camera.model].parameter_names
+    effect = pixel_effect(found.grid, found.lens, lens.cov).parameters
+    statuses = [Status(grade(float(px))) for px in effect]
+    sigmas, plain = (np.sqrt(np.diag(cov)) for cov in (lens.cov, lens.plain))
+    units = ("px",) * 4 + ("",) * (len(names) - 4)
+    parameters = {
+        key: Estimate(value=None, unit=unit, status=status)
+        if status is Status.NOT_OBSERVABLE
+        else Estimate(value=float(v), unit=unit, sigma=float(s), sigma_plain=float(s_plain), status=status)
+        for key, unit, status, v, s, s_plain in zip(names, units, statuses, found.lens, sigmas, plain, strict=True)
+    }
+    unknown = tuple(f"{name}.{key}" for key, status in zip(names, statuses, strict=True) if status is Status.NOT_OBSERVABLE)
+    reasons = _lens_reasons(name, found, lens, unknown)
+    rms, rms_all = found.rms(fit.refined.M)
+    used, seen = int(np.sum(found.grid.weight > 0)), int(np.sum(found.found > 0))
+    texts = [f"estimated with {' and '.join(result.rig.transforms)}, as asked for (--free-intrinsics)"]
+    entry = camera.model_copy(
+        update={
+            "parameters": parameters,
+            "covariance": None if unknown else make_covariance(names, lens.cov),
+            "reprojection": Reprojection(
+                rms_px=rms, rms_all_px=rms_all, corners=used, corners_dropped=seen - used, frames=len(found.found)
+            ),
+            "verdict": worst(reasons),
+            "reasons": [*texts, *(reason.text for reason in reasons)],
+        }
+    )
+    moves = ", ".join(
+        f"{key} {old:.6g} -> {new:.6g} +- {sigma:.2g}" for key, old, new, sigma in zip(names, found.start, found.lens, sigmas, strict=True)
+    )
+    lines = [*list(result.facts["lines"]), f"{name}, with its lens free: {moves}"]  # type: ignore[call-overload]
+    return replace(
+        result,
+        rig=result.rig.model_copy(update={"cameras": {**result.rig.cameras, name: entry}}),
+        reasons=(*result.reasons, *reasons),
+        facts={**result.facts, "lines": lines, "lens": {name: {"before": found.start.tolist(), "after": found.lens.tolist()}}},
+        not_observable=(*result.not_observable, *unknown),
+    )
+
+
+def _lens_reasons(name: str, found: Corners, lens: LensEffect, unknown: tuple[str, ...]) -> tuple[Reason, ...]:
+    """Return that views do not tell the lens, or that it is another than the rig's by more than both their sigmas allow."""
+    reasons = [Reason(Verdict.FAIL, f"{', '.join(unknown)}: not observable by these views: leave out --free-intrinsics")] if unknown else []
+    cov = lens.cov if found.covariance is None else lens.cov + found.covariance
+    d = found.lens - found.start
+    chi2 = float(d @ np.linalg.pinv(cov, hermitian=True, rcond=1e-15) @ d)
+    if chi2 > special.chdtri(len(d), _CHANCE):
+        text = f"{name}: the lens of these images is not the rig's: freed, it moves by {np.sqrt(chi2 / len(d)):.2g} times its sigmas"
+        reasons.append(Reason(Verdict.CHECK, f"{text}; was the focus or the zoom touched?"))
+    return tuple(reasons)

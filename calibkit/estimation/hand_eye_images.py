@@ -123,11 +123,12 @@ def corners_of(views: BoardViews, poses: BoardPoses, camera: Camera, free: bool 
 
 
 def _covariance(camera: Camera, names: tuple[str, ...]) -> Array | None:
-    """Return the lens's covariance in the model's order, or that of its sigmas; None where a parameter has none."""
-    if camera.covariance is not None:
-        order = [camera.covariance.order.index(name) for name in names if name in camera.covariance.order]
-        if len(order) == len(names):
-            return np.array(camera.covariance.matrix)[np.ix_(order, order)]
-    sigmas = [camera.parameters[name].sigma for name in names]
-    known = np.array([np.nan if sigma is None else sigma for sigma in sigmas])
-    return np.diag(known**2) if np.isfinite(known).all() else None
+    """Return the lens's covariance in the model's order; None where it is not all told: sigmas alone say nothing of a lens.
+
+    Coefficients make up for each other; taken for independent, their sigmas move pixels by many times what the lens is known to.
+    """
+    told = camera.covariance
+    if told is None or not set(names) <= set(told.order):
+        return None
+    order = [told.order.index(name) for name in names]
+    return np.array(told.matrix)[np.ix_(order, order)]

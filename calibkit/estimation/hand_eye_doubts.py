@@ -22,6 +22,10 @@ _RESCALED = 0.005  # a length's error that is told
 _ROUNDS = 10
 _FLOOR = 1e-9
 _TOLD = 20  # wrong poses that are looked into
+_ASKED, _FEW = 300, 6  # poses whose angles are compared, and fewer that tell nothing
+_ORDERS = 9
+_ALIKE = 0.5  # of what chance leaves
+_TELLING = np.deg2rad(0.5)  # poses that turn less are alike in any order
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,7 @@ def _least_absolute(M: Array, y: Array) -> tuple[float, Array]:
 def out_of_step(data: HandEyeData) -> int:
     """Return by how many places side 1 is behind side 2 where that fits far better by angles alone (which no X changes), else 0."""
     n = len(data.P)
-    if n < 6 or data.n_worlds > 1:
+    if n < _FEW or data.n_worlds > 1:
         return 0
     left = {}
     for step in (-1, 0, 1):
@@ -144,6 +148,34 @@ def out_of_step(data: HandEyeData) -> int:
         left[step] = _angles_apart(_beside(data, rows, rows - step))
     best = min(left, key=lambda step: left[step])
     return best if left[best] * CLEARLY < left[0] else 0
+
+
+def strangers(first: Array, second: Array) -> bool:
+    """Return whether the angles between poses (n, 4, 4) of two sides, which no X and no setup changes, are no more alike than in any order.
+
+    The better quarter of them counts: with 40 % wrong poses it is still right. Sides that are one place out of step belong together.
+    """
+    a, b = (_turns(T[:_ASKED]) for T in (first, second))
+    n = len(a)
+    if n < _FEW:
+        return False
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(n) for _ in range(_ORDERS)]
+    by_chance = float(np.median([_unlike(a, b[np.ix_(order, order)]) for order in orders]))
+    left = min(_unlike(a, b), _unlike(a[1:, 1:], b[:-1, :-1]), _unlike(a[:-1, :-1], b[1:, 1:]))
+    return by_chance > _TELLING and left > _ALIKE * by_chance
+
+
+def _turns(T: Array) -> Array:
+    """Return the angle between every two poses (n, n)."""
+    R = T[:, :3, :3]
+    cosine = (np.einsum("iab,jab->ij", R, R) - 1) / 2
+    out: Array = np.arccos(np.clip(cosine, -1, 1))
+    return out
+
+
+def _unlike(a: Array, b: Array) -> float:
+    return float(np.quantile(np.abs(a - b)[np.triu_indices(len(a), 1)], 0.25))
 
 
 def _beside(data: HandEyeData, first: Index, second: Index) -> HandEyeData:

@@ -1,4 +1,4 @@
-"""A time offset between the two sides: what the residuals say of one, with X and every Z following it."""
+"""What the residuals say of a time offset between the two sides, and of the scale of their lengths, with X and every Z following it."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,11 @@ from calibkit.estimation.hand_eye_refine import Refined
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
-_LAG_SIGMAS = 5.0
+_SIGMAS = 5.0
 _NEIGHBOURS = 0.5  # s, between whose poses there is a velocity
 _FEWEST = 10  # poses with a velocity
+_LEAST_STRETCH = 0.005  # that is told
+_MOST_STRETCH = 0.3  # that its first order means anything for
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,16 @@ class Lag:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """Side 2's lengths times `factor` fit better."""
+
+    factor: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Column:
-    """What remains of d e / d dt once X and the worlds have followed: least squares of e + column dt."""
+    """What remains of a column g = d e / d dt once X and the worlds have followed: least squares of e + g dt."""
 
     used: Mask  # (n,)
     tells: Array  # (k,) g^T C^-1 g of the k poses used, g what remains: the information about dt
@@ -73,4 +83,19 @@ def lag(data: HandEyeData, fit: Refined, inflation: float) -> Lag | None:
     column = eliminated(data, fit, v, known)
     sigma = float(np.sqrt(inflation / column.whole))
     share = column.dt**2 * column.whole / max(float(np.sum(fit.chi2[column.used])), 1e-300)
-    return Lag(column.dt, sigma, share) if abs(column.dt) > _LAG_SIGMAS * sigma else None
+    return Lag(column.dt, sigma, share) if abs(column.dt) > _SIGMAS * sigma else None
+
+
+def stretch(data: HandEyeData, fit: Refined, inflation: float) -> Stretch | None:
+    """Return the factor on side 2's lengths that the residuals call for, where they do by five sigmas: a board of another size.
+
+    Q's lengths times 1 + s move local(M, Q) by s R_M^T p_M, so e by -s of it.
+    """
+    if not fit.freedom:
+        return None
+    g = np.zeros((len(fit.M), 6))
+    g[:, :3] = np.einsum("nji,nj->ni", fit.M[:, :3, :3], fit.M[:, :3, 3])
+    column = eliminated(data, fit, g, fit.kept)
+    sigma = float(np.sqrt(inflation / column.whole))
+    told = max(_SIGMAS * sigma, _LEAST_STRETCH) < abs(column.dt) < _MOST_STRETCH
+    return Stretch(1 - column.dt, sigma) if told else None

@@ -9,13 +9,12 @@ from calibkit.data.transforms import make_transform
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
-from calibkit.estimation.hand_eye_asked import REFINED, Asked
+from calibkit.estimation.hand_eye_asked import Asked
 from calibkit.estimation.hand_eye_doubts import suspects
 from calibkit.estimation.hand_eye_facts import facts
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.hand_eye_lines import lines, methods_table
 from calibkit.estimation.hand_eye_normal import SCALES
-from calibkit.estimation.hand_eye_redrawn import by_closed_form
 from calibkit.estimation.hand_eye_verdict import judge_hand_eye
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -26,8 +25,6 @@ STAGE = "handeye"
 
 def hand_eye_result(fit: HandEyeFit, asked: Asked) -> Result:
     """Return the result of stage `handeye`: X = T_1_2 and, where there is one, Z = T_w1_w2."""
-    if asked.method != REFINED:
-        fit = by_closed_form(fit, asked.method)
     one, two, w1, w2 = fit.data.words.frames
     name, fixed = f"T_{one}_{two}", f"T_{w1}_{w2}"
     wrong = suspects(fit)

@@ -12,7 +12,7 @@ import numpy as np
 from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye, select
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.hand_eye_doubts import CLEARLY, misfit
+from calibkit.estimation.hand_eye_doubts import CLEARLY, misfit, strangers
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
@@ -23,6 +23,10 @@ _WORDS = {
     "eye-in-hand": "eye-in-hand (the camera on the gripper)",
     "eye-to-hand": "eye-to-hand (the camera fixed, the board on the gripper)",
     "motion": "motion (two sensors)",
+}
+_HINTS = {
+    "eye-in-hand": "if the camera is on the gripper",
+    "eye-to-hand": "if the camera is fixed beside the robot",
 }
 _OTHER = {
     "eye-in-hand": f"--setup {_WORDS['eye-to-hand']}, or the same poses the other way round (--inverse-poses),",
@@ -46,6 +50,11 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
 
     BadInputError where none does clearly.
     """
+    if strangers(first, second):
+        raise BadInputError(
+            "the turns between poses of the two sides are no more alike than chance: they do not belong together, or one side is read "
+            "wrongly; check which pose belongs to which image, --pose-format, --angle-unit, and the board"
+        )
     left = {sign: _left(first, second, sign) for sign in (1, -1)}
     sign_of = {setup: SIGNS[setup][0] * SIGNS[setup][1] for setup in SIGNS}
     best = 1 if left[1] < left[-1] else -1
@@ -58,8 +67,7 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
             raise BadInputError(f"the poses do not tell {' from '.join(able)}: give --setup {' or '.join(able)}")
         asked = able[0]
         if len(candidates) > 1:
-            rest = " or ".join(setup for setup in candidates if setup != asked)
-            return Choice(asked, f"{_WORDS[asked]}: it fits {times:.3g} times better than {rest}, or than poses the other way round")
+            return Choice(asked, _chosen(asked, times, [setup for setup in candidates if setup != asked]))
     if sign_of[asked] != best and times > CLEARLY:
         return Choice(asked, "", _OTHER[asked], times)
     return Choice(asked)
@@ -74,7 +82,14 @@ def choose_fit(fits: Mapping[str, HandEyeFit]) -> tuple[str, str]:
     times = left[ranked[1]] / left[ranked[0]]
     if times < CLEARLY:
         raise BadInputError(f"the poses do not tell {' from '.join(ranked)}: give --setup {' or '.join(ranked)}")
-    return ranked[0], f"{_WORDS[ranked[0]]}: it fits {times:.3g} times better than {ranked[1]}, or than poses the other way round"
+    return ranked[0], _chosen(ranked[0], times, ranked[1:2])
+
+
+def _chosen(setup: str, times: float, others: Sequence[str]) -> str:
+    """Return how a setup was chosen; poses the other way round make the other one fit, so that is said, too."""
+    said = f"{_WORDS[setup]}: it fits {times:.3g} times better than {' or '.join(others)}"
+    other = next((other for other in others if other in _HINTS), "")
+    return f"{said}; {_HINTS[other]}, the poses are the other way round: --setup {other} --inverse-poses" if other else said
 
 
 def _left(first: Array, second: Array, sign: int) -> float:

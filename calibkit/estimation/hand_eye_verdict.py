@@ -8,6 +8,7 @@ from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_doubts import Suspect
 from calibkit.estimation.hand_eye_known import parameter_statuses
+from calibkit.estimation.hand_eye_lag import stretch
 from calibkit.estimation.hand_eye_open import Open
 
 GOOD_POSES = 10
@@ -29,7 +30,8 @@ class Doubts:
 
 def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubts: Doubts, method: str) -> tuple[Reason, ...]:
     """Return the reasons about `name` = T_1_2, PASS where there is nothing to say."""
-    reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in (*_doubtful(doubts), *_open(fit), *_poses(fit, wrong), *_about(fit))]
+    found = (*_doubtful(fit, doubts), *_open(fit), *_poses(fit, wrong), *_about(fit))
+    reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in found]
     chosen = fit.methods.get(method)
     if chosen is not None and chosen.failed:
         reasons.append(Reason(Verdict.FAIL, f"{name}: {method}, which was asked for, is far from the refined X: take --method refined"))
@@ -37,7 +39,7 @@ def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubt
 
 
 def _open(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
-    advice = "; ".join(a.text for a in fit.advice)
+    advice = "; ".join(dict.fromkeys(a.text for a in fit.advice))
     hidden = [key for key, status in parameter_statuses(fit.X, fit.cov_X).items() if status is Status.NOT_OBSERVABLE]
     out = []
     for grade, verdict in (("not observable", Verdict.FAIL), ("weak", Verdict.CHECK)):
@@ -52,13 +54,17 @@ def _unit(o: Open) -> str:
     return "mm" if o.text.startswith("p ") else "mrad"
 
 
-def _doubtful(doubts: Doubts) -> list[tuple[Verdict, str]]:
+def _doubtful(fit: HandEyeFit, doubts: Doubts) -> list[tuple[Verdict, str]]:
     out = []
     if doubts.better:
         out.append((Verdict.FAIL, f"{doubts.better} fits {doubts.times:.3g} times better"))
     if doubts.step:
         out.append((Verdict.FAIL, doubts.step))
     s = doubts.length_ratio
+    by_little = stretch(fit.data, fit.refined, fit.trusted.inflation) if s is None and not out else None
+    if by_little is not None:
+        text = f"the second side's lengths times {by_little.factor:.4f} +- {by_little.sigma:.2g} fit better"
+        out.append((Verdict.CHECK, f"{text}: measure the board's squares, and check the target file and the units of the poses"))
     if s is not None:
         unit = next((f": {text}" for factor, text in _UNITS if abs(s / factor - 1) < 0.05), "")
         text = f"the second side's lengths times {s:.4g} fit far better{unit or ': check the size of the board and the units of the poses'}"

@@ -21,6 +21,8 @@ _NUMBER = re.compile(r"[0-9]{1,20}(\.[0-9]{1,9})?")
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
 _END_OF_TIME = 2**62  # ns, in 2116: what lies beyond is no time, but a date such as 20230131120000, say
 
+NO_STAMPS = "file names are no stamps"
+
 
 def is_image(path: Path) -> bool:
     """Tell by its name whether a file is an image that can be read."""
@@ -42,7 +44,7 @@ def image_folder(folder: Path, name: str) -> Source:
     stamps = [stamp_ns(path.stem) for path in files]
     source = Source(name, files)
     if None in stamps or len(set(stamps)) < len(stamps):
-        source.warn(f"{name}: file names are no stamps (s, ms, us or ns since 1970): all images have time 0")
+        source.warn(f"{name}: {NO_STAMPS} (s, ms, us or ns since 1970): all images have time 0")
         frames = [(0, path) for path in files]
     else:
         frames = sorted((t, path) for t, path in zip(stamps, files, strict=True) if t is not None)

@@ -26,8 +26,8 @@ _OPTIONS = {  # that choose a topic of this kind
     "image": "--camera",
     "corners": "--camera",
     "imu": "--imu",
-    "pose": "--of and --to",
-    "twist": "--of and --to",
+    "pose": "--pose",
+    "twist": "--pose",
 }
 
 

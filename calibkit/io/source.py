@@ -15,13 +15,13 @@ Times = NDArray[np.int64]
 
 # What a topic of each kind is good for, as `calibkit info` tells it.
 USES = {
-    "image": "intrinsics (with --target), timeoffset",
+    "image": "intrinsics (with --target), timeoffset, handeye (with --target)",
     "imu": "allan, imu, timeoffset; joint (yet to come)",
-    "pose": "timeoffset; handeye (yet to come)",
+    "pose": "timeoffset, handeye",
     "twist": "timeoffset",
-    "tf": "timeoffset (with --pose tf:PARENT/CHILD); handeye (yet to come)",
+    "tf": "timeoffset and handeye (with --pose tf:PARENT/CHILD)",
     "camera_info": "the driver's own calibration, to compare with",
-    "corners": "intrinsics (with --target and --resolution), timeoffset (with --target)",
+    "corners": "intrinsics (with --target and --resolution), timeoffset and handeye (with --target)",
     "cloud": "nothing yet",
     "video": "nothing: video-coded images are not read; record sensor_msgs/CompressedImage (jpeg or png) instead",
     "other": "nothing",

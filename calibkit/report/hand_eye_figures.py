@@ -132,7 +132,7 @@ def cross_sections(figure: Figure, view: View) -> None:
         panel.plot(gone[:, i], gone[:, j], "x", color=ACCENT, ms=5, rasterized=True)
         if cov is not None:
             panel.plot(*_ellipse(cov[np.ix_((i, j), (i, j))]), color=INK, lw=1.6, label="95 % of the estimate")
-        panel.plot(0, 0, "+", color=INK, ms=9, mew=1.6, label="refined")
+        panel.plot(0, 0, "+", color=INK, ms=9, mew=1.6, label=hand_eye.written)
         for (name, p), mark in zip(others.items(), _MARKS, strict=False):
             if name not in outside:
                 panel.plot(p[i], p[j], mark, color="white", mec="black", ms=5.5, label=name)

@@ -30,6 +30,7 @@ class HandEye:
     w2: str = "target"
     Z: Array | None = None
     methods: Mapping[str, Array] = field(default_factory=dict)  # p (3,) by other methods
+    written: str = "refined"  # the method that X is by
 
 
 def hand_eye_of(result: Result, sensor: str) -> HandEye | None:
@@ -53,7 +54,9 @@ def hand_eye_of(result: Result, sensor: str) -> HandEye | None:
         if p is not None:
             found[one_line(name, 20)] = p
     Z = None if other is None else np.array(other.matrix)
-    return HandEye(one, two, np.array(entry.matrix), _cov(entry) if known else None, known, w1, w2, Z, found)
+    written = one_line(facts.get("written", "refined"), 20)
+    found.pop(written, None)
+    return HandEye(one, two, np.array(entry.matrix), _cov(entry) if known else None, known, w1, w2, Z, found, written)
 
 
 def _cov(entry: Transform) -> Array | None:

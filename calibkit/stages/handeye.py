@@ -16,6 +16,7 @@ from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_record
 from calibkit.estimation.hand_eye_doubts import length_ratio, out_of_step, told_step
 from calibkit.estimation.hand_eye_methods import METHODS
 from calibkit.estimation.hand_eye_pixels import corner_rms
+from calibkit.estimation.hand_eye_redrawn import by_closed_form
 from calibkit.estimation.hand_eye_result import hand_eye_result
 from calibkit.estimation.hand_eye_setup import SIGNS, Choice, choose_setup
 from calibkit.estimation.hand_eye_verdict import Doubts
@@ -23,6 +24,7 @@ from calibkit.estimation.hand_eye_world import WORLD_METHODS
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.stages.handeye_images import check, corners, freed, how, robot_noise, with_images
+from calibkit.stages.handeye_pictures import worst_images
 from calibkit.stages.handeye_poses import gather
 from calibkit.stages.handeye_sides import Options, Sides
 from calibkit.stages.outputs import Outputs, Saved, save
@@ -43,6 +45,8 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
         choice = _choice(sides, options)
         seen = corners(sides, base, options)
         fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options), Settings(robot=robot_noise(options.robot_noise)), seen)
+        if options.method != REFINED:
+            fit = by_closed_form(fit, options.method)
     except BadInputError as error:
         raise BadInputError(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
     step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
@@ -67,6 +71,8 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     if sides.board is not None and sides.board.lens is not None:
         result = _with_lens(result, sides.board.lens)
     result = with_images(result, fit, sides, options)
+    if sides.board is not None and (outputs.out is not None or outputs.report is not None):
+        result = replace(result, thumbnails=worst_images(fit, sides, freed(fit, sides.board.camera), progress))
     return save(result, base, outputs, sides.inputs, _told(options, fit.data.setup))
 
 

@@ -1,6 +1,7 @@
 """The two sides' poses of `calibkit handeye`, wherever they come from: pairs, a robot's file beside images, streams of a recording."""
 
 from collections.abc import Sequence
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from calibkit.estimation.board_poses import board_poses
 from calibkit.estimation.intrinsics import CameraRequest, calibrate_cameras
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
+from calibkit.io.folder import NO_STAMPS
 from calibkit.io.pose_files import PoseTable, load_pose_pairs, load_poses
 from calibkit.io.pose_match import match_images
 from calibkit.io.recording import Recording, open_recording
@@ -22,6 +24,8 @@ from calibkit.stages.handeye_sides import ROBOT, Options, Seen, Sides, arm_names
 from calibkit.stages.handeye_streams import beside_board, of_file, robot_stream, two_streams
 from calibkit.stages.intrinsics import AUTO, name_cameras, observe
 from calibkit.stages.intrinsics import Options as LensOptions
+
+_NEEDLESS = (NO_STAMPS, "is not recognised: ")
 
 
 def gather(sources: Sequence[Path], rig: Rig, options: Options, progress: Progress) -> Sides:
@@ -86,11 +90,13 @@ def _robot(recording: Recording, rig: Rig, options: Options, progress: Progress)
 def _look(recording: Recording, rig: Rig, name: str, topic: str, options: Options, progress: Progress) -> Seen:
     """Return the board's poses, by the rig file's lens, else by one that is calibrated from the same images."""
     assert options.target is not None
-    known = rig.cameras.get(name)
+    known, images = rig.cameras.get(name), None
+    if any(t.name == topic and t.kind == "image" for t in recording.topics):
+        images = partial(recording.images, topic)
     asked = LensOptions(resolution=options.resolution or (known.resolution if known else None), cache=options.cache)
     views = observe(recording, {name: topic}, load_target(options.target), asked, progress)[0]
     if known is not None:
-        return Seen(views, board_poses(views, known), known, None)
+        return Seen(views, board_poses(views, known), known, None, images)
     lens = calibrate_cameras([CameraRequest(views, _model(options.model), one_line(topic))], progress=progress)
     camera = lens.rig.cameras[name]
     unknown = [key for key, value in camera.parameters.items() if value.value is None]
@@ -99,7 +105,7 @@ def _look(recording: Recording, rig: Rig, name: str, topic: str, options: Option
             f"{name}: these images do not tell its lens ({', '.join(unknown)}): add --rig RIG.yaml of calibkit intrinsics, "
             "or images of the board tilted by 30 to 45 deg"
         )
-    return Seen(views, board_poses(views, camera), camera, lens)
+    return Seen(views, board_poses(views, camera), camera, lens, images)
 
 
 def _model(name: str) -> str | None:
@@ -135,9 +141,14 @@ def _beside(
         board.poses.cov[chosen],
         only(board, chosen),
         (matches.how.replace(one_line(table.path), one_line(table.path.name)), *_unseen(board, len(images)), *_notes(table)),
-        (*(text for text in recording.warnings if not text.startswith(table.path.name)), *board.views.warnings),
+        (*_of_account(recording.warnings, table), *board.views.warnings),
         tuple(inputs),
     )
+
+
+def _of_account(warnings: Sequence[str], table: PoseTable) -> list[str]:
+    """Return warnings without those that say nothing here: of stamps where images go by name or order, of a folder's pose files."""
+    return [text for text in warnings if not text.startswith(table.path.name) and not any(part in text for part in _NEEDLESS)]
 
 
 def _unseen(board: Seen, images: int) -> list[str]:

@@ -1,12 +1,13 @@
 """What `calibkit handeye` is asked, and what it has of both sides before anything is estimated."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.observations import BoardViews
+from calibkit.data.observations import BoardViews, ImageFrame
 from calibkit.data.result import Result
 from calibkit.data.rig import Camera, TimeOffset
 from calibkit.data.verdict import Reason
@@ -60,6 +61,7 @@ class Seen:
     poses: BoardPoses
     camera: Camera
     lens: Result | None  # where it was calibrated on the way
+    images: Callable[[], Iterator[ImageFrame]] | None = None  # to be read again; None of corner files
 
 
 @dataclass(frozen=True)

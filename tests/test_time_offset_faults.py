@@ -206,7 +206,7 @@ def test_repeated_stamps_are_named(seeds: tuple[int, ...]) -> None:
 
 
 def test_a_stamp_that_is_not_set_is_named() -> None:
-    sample, fit, said = faulty("zero-stamp", 0, 20.0)
+    sample, fit, said = faulty("zero-stamp", 0, 30.0)
     assert re.search(r"1 (stamp is|frame has a stamp of) zero", said), said
     assert abs(fit.td - sample.td) < 4 * fit.sigma < 1e-4
 

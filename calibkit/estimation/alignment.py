@@ -98,14 +98,14 @@ def settle(a: Alignment, levels: NoiseLevels | None, progress: Progress = silent
         same = not first and all(np.array_equal(x, y) for x, y in zip(kept, a.keep, strict=True))
         a = weighed(replace(a, keep=kept))
         if levels is None:
-            a = weighed(_with_levels(a, jitter=not first))
+            a = weighed(with_levels(a, jitter=not first))
         if same:
             break
         first = False
     return newton(a)
 
 
-def _with_levels(a: Alignment, jitter: bool) -> Alignment:
+def with_levels(a: Alignment, jitter: bool) -> Alignment:
     """Return the alignment with the axes' relative variances (by medians) and the noise's levels as its residuals have them."""
     left = [raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[0] for part in a.parts]
     axes = a.parts[0].stretch.axes
@@ -224,6 +224,13 @@ def turned_alike(a: Alignment, parts: Sequence[Array]) -> float:
     """Return by how much chi-squared is lower with the track's turns than without: below nothing where the track has noise alone."""
     without = sum(float(np.sum(part.clean(part.stretch.turns.angle[:, part.stretch.axes]) ** 2)) for part in a.parts)
     return without - sum(float(np.sum(X[:, -1] ** 2)) for X in parts)
+
+
+def turned_by(a: Alignment) -> tuple[Array, Array]:
+    """Return the whitened turns (rows,), and those that the track predicts for them."""
+    own = [part.clean(part.stretch.turns.angle[:, part.stretch.axes]) for part in a.parts]
+    other = [part.clean(part.stretch.beta(a.track, a.shift(part.stretch.t)[:, None])[:, 0] @ a.R.T) for part in a.parts]
+    return np.concatenate(own), np.concatenate(other)
 
 
 def noise_information(a: Alignment) -> float:

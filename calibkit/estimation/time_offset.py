@@ -26,6 +26,7 @@ from calibkit.estimation.alignment import (
 from calibkit.estimation.clock import Clock, fit_clock
 from calibkit.estimation.clock_jumps import placed
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
+from calibkit.estimation.slow_turns import by_slow_turns, joined_up, turns_in_long_one
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset_start import Start, find_starts
 from calibkit.estimation.turn_comparison import raw_residuals, split, usable
@@ -46,6 +47,8 @@ _AGAIN = 2
 _APART_S = 0.02  # what two starts lead to within is one bottom
 _PROFILE = 41
 _LEAST_SHARE = 1e-6  # of the information that is taken for real
+_CONTRADICTED = 12.25  # chi-squared of one degree of freedom: 3.5 sigma
+_TURNING, _OTHER_UNIT = 0.1, 0.4  # rad/s; of the logarithm
 _CLOCKS = 4  # times that a clock is looked at
 
 
@@ -81,6 +84,7 @@ class TimeOffsetFit:
     n_turns: int  # in the overlap
     gain: float  # chi-squared that the reference's turns explain, correlation paid for
     noise_share: float  # of the information on tau, that noise pretends
+    by_fast_turns: tuple[float, float] | None = None  # td and sigma by turns from stamp to stamp, where they contradict these
 
     @property
     def td(self) -> float:
@@ -105,13 +109,30 @@ def _inflation(covariance: Covariance) -> float:
 
 
 def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress = silent) -> TimeOffsetFit:
-    """Return the offset that lays the turns best against the reference.
+    """Return the offset that lays the turns best against the reference; by long turns, where those contradict the short ones.
 
     BadInputError where the two share too little time. What the fit is worth is for `time_offset_verdict` to say.
     """
+    fit = _fit(turns, reference, settings, progress)
+    slow = by_slow_turns(fit.alignment) if settings.levels is None else None
+    if slow is None or not _contradicts(fit, slow):
+        return fit
+    long = joined_up(turns, turns_in_long_one(turns))
+    return replace(_fit(long, reference, settings, progress), by_fast_turns=(fit.td, fit.sigma))
+
+
+def _contradicts(fit: TimeOffsetFit, slow: Alignment) -> bool:
+    """Whether long turns tell another offset, by Hausman's test with half their variance at least: chance may bring it below."""
+    variance = float(_covariance(slow, columns(slow)).corrected[0, 0])
+    apart = (slow.tau - fit.alignment.tau) ** 2 / max(variance - fit.sigma**2, variance / 2)
+    return apart > _CONTRADICTED and abs(slow.tau - fit.alignment.tau) > SCALES["s"]
+
+
+def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress) -> TimeOffsetFit:
     if check_stamps(reference.t_ns).bursts:
         raise BadInputError("the stamps of the second come in bursts: they are times of arrival; record the sensor's own clock")
     track = track_of_gyro(reference) if isinstance(reference, ImuSamples) else track_of_poses(reference)
+    _refuse_other_unit(turns, track)
     starts = find_starts(turns, track, settings.rotation)
     if not starts:
         raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
@@ -156,6 +177,15 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
         noise_share=noise_share,
     )
     return replace(fit, second=_second(fit, starts[1:]))
+
+
+def _refuse_other_unit(turns: Turns, track: OrientationTrack) -> None:
+    """Refuse streams of which one turns as much faster as degrees are more than radians."""
+    own = float(np.percentile(np.linalg.norm(turns.angle, axis=1) / turns.duration, 90)) if len(turns.first) else 0.0
+    other = float(np.percentile(np.linalg.norm(track.rate[track.chain >= 0], axis=1), 90)) if np.any(track.chain >= 0) else 0.0
+    if min(own, other) > _TURNING and abs(np.log(max(own, other) / min(own, other) * np.pi / 180)) < _OTHER_UNIT:
+        which = ("first", "second") if own > other else ("second", "first")
+        raise BadInputError(f"the {which[0]} turns 57 times as fast as the {which[1]}: a gyroscope in deg/s; give --gyro-unit deg/s")
 
 
 def bootstrap_sigma(fit: TimeOffsetFit, draws: int, seed: int = 0) -> float:

@@ -25,7 +25,6 @@ class Start:
 
     coarse_ns: int  # added to the stamps of the turns to give the track's clock, to some ms
     R: Array  # (d, 3): beta of the track, turned into the measured axes of the turns
-    unlike: float  # what is left of the turns, as a share: 0 where both turn alike, 1 where they have nothing in common
     correlation: float  # of |omega| at this lag, 0 where it was not looked for by correlation
 
 
@@ -68,7 +67,7 @@ def _try(turns: Turns, track: OrientationTrack, rotation: Array | None, candidat
     left = np.sum(w[:, :, None] * (alpha - np.einsum("kij,nkj->nki", R, beta)) ** 2, axis=(0, 2))
     share = left / np.maximum(np.sum(w[:, :, None] * alpha**2, axis=(0, 2)), 1e-300)
     k = int(np.argmin(share))
-    start = Start(coarse_ns + round(tau[k] * 1e9), np.array(R[k]), float(share[k]), candidate.correlation)
+    start = Start(coarse_ns + round(tau[k] * 1e9), np.array(R[k]), candidate.correlation)
     return len(part.first) * float(np.log(max(share[k], 1e-12))), start
 
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.data.verdict import Reason, Status, Verdict
-from calibkit.estimation.alignment import axis_offsets
+from calibkit.estimation.alignment import axis_offsets, turned_by
 from calibkit.estimation.clock import describe
+from calibkit.estimation.slow_turns import LONG_S
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.stamps import describe as stamps_in_words
 from calibkit.estimation.time_offset import TimeOffsetFit
@@ -19,6 +20,9 @@ _PRETENDED = 0.2  # of the information may be noise in the rates
 _BOWL = 25.0  # chi-squared of the V's bottom below its sides
 _STILL = 0.02  # rad/s; slower is standing still
 _UNLIKE = 0.5  # of the turns may be left unexplained
+_STRANGERS = 0.9
+_SCALE, _OTHER_UNIT = 0.03, 0.2  # of the turns' sizes
+_SURE = 10.0  # sigmas
 _LOST = 0.1  # of the turns may be outliers
 _MOSTLY_LOST = 0.5
 _CONTRARY = 1.4  # of an axis' turns is left by a prediction of the wrong sign: 2; by one that has nothing to do with it, 1
@@ -45,17 +49,18 @@ def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: d
     why = _not_observable(of, to, fit)
     found = [(sensor, text) for sensor, report in stamps.items() for text in stamps_in_words(report, "frame", _MISSING, _JITTER_S)]
     spoilt = [Reason(Verdict.CHECK, f"{sensor}: {text}") for sensor, text in found]
+    scale = [Reason(verdict, f"{name}: {text}") for verdict, text in _scale(of, to, fit)]
     if why:
-        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {why}"), *spoilt))
+        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {why}"), *scale, *spoilt))
     known = grade(fit.sigma / SCALES["s"])
     if known == "not observable":
         text = f"not observable: its sigma would be {fit.sigma * 1e3:.2g} ms; {_advice(fit)}"
-        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: {text}"), *spoilt))
+        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: {text}"), *scale, *spoilt))
     reasons = []
     if known == "weak":
         reasons.append(Reason(Verdict.CHECK, f"{name}: weak: known to {fit.sigma * 1e3:.2g} ms only; {_advice(fit)}"))
     reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in _doubts(of, to, fit)]
-    return Judged(Status(known), (*reasons, *spoilt))
+    return Judged(Status(known), (*reasons, *scale, *spoilt))
 
 
 def rates(fit: TimeOffsetFit) -> tuple[float, float]:
@@ -74,7 +79,7 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
     if fit.gain < _ALIKE or fit.noise_share > _PRETENDED or fit.depth < _BOWL:
         if fast < _STILL or float(np.median(np.linalg.norm(known, axis=1))) < _STILL:
             return f"the rig hardly turns ({middle:.2g} rad/s in the middle): at rest every offset fits alike; {_MOTION}"
-        if change > 0.3 and (fit.gain < _ALIKE or fit.start.unlike > _UNLIKE):
+        if change > 0.3 and (fit.gain < _ALIKE or _unlike(fit) > _UNLIKE):
             return (
                 f"{of} and {to} never turn alike at any offset: are both on one rigid body, do they overlap in time, is a topic wrong, "
                 "or are the poses those of the world seen from the sensor (--inverse-poses)?"
@@ -82,6 +87,9 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
         return f"the rate of turn hardly changes (about {middle:.2g} rad/s): a constant rate fits every offset alike; {_MOTION}"
     if not 1 < int(np.argmin(fit.cost)) < len(fit.cost) - 2:
         return f"the V has no bottom within {fit.tau[-1] * 1e3:.0f} ms of {fit.td * 1e3:+.1f} ms: the two streams do not fit together"
+    if fit.second is not None:
+        both = f"{fit.second * 1e3:+.3f} ms fits as well as {fit.td * 1e3:+.3f} ms"
+        return f"{both}: the motion repeats itself; turn irregularly, about several axes"
     return ""
 
 
@@ -105,9 +113,11 @@ def _advice(fit: TimeOffsetFit) -> str:
 def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     found = []
     td = fit.td * 1e3
-    if fit.second is not None:
-        text = f"{fit.second * 1e3:+.3f} ms fits as well as {td:+.3f} ms: the motion repeats itself; turn irregularly, about several axes"
-        found.append((Verdict.FAIL, text))
+    if fit.by_fast_turns is not None:
+        fast, sigma = fit.by_fast_turns
+        other = f"{fast * 1e3:+.3f} +- {sigma * 1e3:.2g} ms"
+        text = f"fast and slow motion disagree: turns of {LONG_S:.1f} s say {td:+.3f} ms, those from stamp to stamp {other}"
+        found.append((Verdict.CHECK, f"{text}: either may be off by as much; look for a filter, blur or vibration in {of} or {to}"))
     clock = fit.clock
     if clock is not None and clock.kind != "constant":
         verdict = Verdict.FAIL if clock.jumps else Verdict.CHECK
@@ -115,9 +125,15 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
         found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, rate)]
     if fit.alignment.levels.jitter > _JITTER_S**2:
         jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
-        found.append((Verdict.CHECK, f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms"))
-    if fit.start.unlike > _UNLIKE:
-        found.append((Verdict.CHECK, f"{of} and {to} turn only partly alike: {100 * fit.start.unlike:.0f} % of the turns is noise"))
+        found.append(
+            (
+                Verdict.CHECK,
+                f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms, or it is worse in fast motion",
+            )
+        )
+    if (unlike := _unlike(fit)) > _UNLIKE:
+        verdict = Verdict.FAIL if unlike > _STRANGERS else Verdict.CHECK
+        found.append((verdict, f"{of} and {to} turn only partly alike: {100 * unlike:.0f} % of the turns is noise"))
     lost = 1 - sum(int(keep.sum()) for keep in fit.alignment.keep) / max(fit.n_turns, 1)
     if lost > _LOST:
         verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
@@ -133,13 +149,38 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     return found
 
 
+def _unlike(fit: TimeOffsetFit) -> float:
+    """Return the share of the turns, their mean rate apart, that the fit leaves."""
+    left, turned = _left_of_turns(fit)
+    return float(np.sum(left**2) / max(np.sum(turned**2), 1e-300))
+
+
+def _left_of_turns(fit: TimeOffsetFit) -> tuple[Array, Array]:
+    """Return what the fit leaves of the kept turns, and the turns less their stretch's median (n, d) rad."""
+    a = fit.alignment
+    left = [raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[0] for part in a.parts]
+    angles = [part.stretch.turns.angle[:, part.stretch.axes] for part in a.parts]
+    return np.concatenate(left), np.concatenate([angle - np.median(angle, axis=0) for angle in angles])
+
+
+def _scale(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
+    """Say so where one turns by more than the other: s = sum alpha . R beta / sum |R beta|^2 of whitened turns, for one axis |R|."""
+    a = fit.alignment
+    own, other = turned_by(a)
+    information = max(float(np.sum(other**2)), 1e-300)
+    scale = float(np.sum(own * other)) / information if len(a.R) == 3 else float(np.linalg.norm(a.R))
+    sigma = np.sqrt(fit.covariance.variance_factor / information)
+    if scale < _SURE * sigma or abs(scale - 1) < max(_SCALE, _SURE * sigma, fit.noise_share):
+        return []
+    verdict = Verdict.FAIL if abs(np.log(scale)) > _OTHER_UNIT else Verdict.CHECK
+    degrees = abs(abs(np.log(scale)) - np.log(180 / np.pi)) < _OTHER_UNIT
+    cause = "a gyroscope in deg/s: --gyro-unit" if degrees else "a gyroscope's scale or unit, or a wrong focal length; calibrate that first"
+    return [(verdict, f"{of} turns {scale:.3g} times as far as {to}: {cause}")]
+
+
 def _contrary(of: str, to: str, fit: TimeOffsetFit) -> list[str]:
     """Say which axes the prediction makes worse while it explains others: a flipped sign that no rotation makes."""
-    a = fit.alignment
-    left = np.concatenate([raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[0] for part in a.parts])
-    turned = np.concatenate([part.stretch.turns.angle - np.median(part.stretch.turns.angle, axis=0) for part in a.parts])[
-        :, a.parts[0].stretch.axes
-    ]
+    left, turned = _left_of_turns(fit)
     share = np.sqrt(np.mean(left**2, axis=0) / np.maximum(np.mean(turned**2, axis=0), 1e-300))
     worse = [axis for axis, each in zip("xyz", share, strict=False) if each > _CONTRARY]
     if len(share) < 3 or not worse or share.min() > _EXPLAINED:

@@ -22,6 +22,7 @@ _TRIED = 4  # best places of each kind of change whose likelihood is computed in
 _BESIDE, _CLEAR = 3, 8.0  # windows on each side whose medians tell a jump that is clear at once; sigmas
 _PRICE = 16.0  # -2 ln likelihood that a change must gain; tuned for false alarms below 0.5 % (tests/test_clock.py)
 _RIDGE = 1e-12  # of the weights, for a drift over no time
+_LONG = 8  # changes; beyond, jumps are moved only when none is added any more
 _ENOUGH = 0.01  # of -2 ln likelihood; prices are a thousand times that
 _PRICE_PLACE = 3.0  # more for each ln of the places where a jump could be
 STRADDLES = 5.0  # sigmas off, above which a window tells nothing, but that a jump is inside
@@ -108,13 +109,13 @@ def _cost(r: Array, log_scatter: float) -> float:
 def search(windows: Windows) -> Fit:
     """Return the best model that is reached from a constant clock, or from the best smooth drift or all jumps that are clear at once.
 
-    From the first alone, many jumps hide each other, and a slow wander is taken for a staircase.
+    From the first alone, many jumps hide each other, and a slow wander is taken for a staircase: it is given up when it gets long.
     """
     n = len(windows.td)
     drifts = [fit_model(windows, model) for degree in range(_MAX_DEGREE + 1) if (model := Model(degree)).fits(n)]
     stairs = [fit_model(windows, model) for degree in (0, 1) if (model := Model(degree, _clear_jumps(windows))).fits(n)]
-    best = _best([*drifts, _settle(windows, _best(stairs))])
-    return _best([_grow(windows, fit) for fit in {fit.model: fit for fit in (drifts[0], best)}.values()])
+    best = _grow(windows, _best([*drifts, _settle(windows, _best(stairs))]))
+    return _best([best, _grow(windows, drifts[0], best.value)])
 
 
 def _best(fits: list[Fit]) -> Fit:
@@ -138,39 +139,42 @@ def _clear_jumps(windows: Windows) -> tuple[int, ...]:
     return tuple(sorted(places))
 
 
-def _grow(windows: Windows, best: Fit) -> Fit:
-    """Add the change that gains most, move the jumps, drop what is no longer needed; until nothing gains."""
-    while True:
-        better = min((fit_model(windows, model) for model in _grown(windows, best)), key=lambda fit: fit.value, default=best)
-        if better.value >= best.value:
-            return best
-        best = _settle(windows, better)
+def _grow(windows: Windows, best: Fit, rival: float = np.inf) -> Fit:
+    """Add the change that gains most, move the jumps, drop what is no longer needed; until nothing gains, or a long way above a rival."""
+    while best.value < rival or best.model.degree + len(best.model.steps) < _LONG:
+        better = _best([best, *(fit_model(windows, model) for model in _grown(windows, best))])
+        settled = _settle(windows, better) if better is best or len(better.model.steps) < _LONG else better
+        if settled is best:
+            break
+        best = settled
+    return best
 
 
 def _settle(windows: Windows, best: Fit) -> Fit:
-    """Try the neighbours of a model as long as one of them is better."""
-    while True:
-        better = min(
-            (fit_model(windows, model) for model in _neighbours(best.model, len(windows.td))), key=lambda fit: fit.value, default=best
-        )
-        if better.value >= best.value:
-            return best
+    """Try a simpler drift and what each jump could be instead, in turn, until none of them is better."""
+    i = calm = 0
+    while calm <= len(best.model.steps):
+        i = (i + 1) % (len(best.model.steps) + 1)
+        better = _best([best, *(fit_model(windows, model) for model in _neighbours(best.model, len(windows.td), i))])
+        calm = calm + 1 if better is best else 0
         best = better
+    return best
 
 
-def _neighbours(model: Model, n: int) -> Iterator[Model]:
-    """Yield the model with a simpler drift, without one of its jumps, and with one jump a window earlier or later."""
-    for degree in {0, model.degree // 2, model.degree - 1, model.degree - 2} & set(range(model.degree)):
-        yield replace(model, degree=degree)
-    for i, k in enumerate(model.steps):
-        others = model.steps[:i] + model.steps[i + 1 :]
-        yield replace(model, steps=others)
-        if (new := replace(model, steps=others, degree=model.degree + 1)).fits(n):
-            yield new  # a slope that looked like a jump
-        for moved in (k - 1, k + 1):
-            steps = tuple(sorted({*others, moved}))
-            if len(steps) == len(model.steps) and (new := replace(model, steps=steps)).fits(n):
-                yield new
+def _neighbours(model: Model, n: int, i: int) -> Iterator[Model]:
+    """Yield the model with a simpler drift (i = 0), or without its i-th jump or with that a window earlier or later."""
+    if i == 0:
+        for degree in {0, model.degree // 2, model.degree - 1, model.degree - 2} & set(range(model.degree)):
+            yield replace(model, degree=degree)
+        return
+    k, others = model.steps[i - 1], model.steps[: i - 1] + model.steps[i:]
+    yield replace(model, steps=others)
+    if (new := replace(model, steps=others, degree=model.degree + 1)).fits(n):
+        yield new  # a slope that looked like a jump
+    for moved in (k - 1, k + 1):
+        steps = tuple(sorted({*others, moved}))
+        if len(steps) == len(model.steps) and (new := replace(model, steps=steps)).fits(n):
+            yield new
 
 
 def _grown(windows: Windows, fit: Fit) -> Iterator[Model]:

@@ -152,7 +152,7 @@ def rested(seed: int, rest: float, lively: float, quiet: float, loud: float, td:
 @pytest.mark.parametrize(
     ("rest", "lively", "quiet", "seeds"),
     [
-        (60.0, 15.0, 1e-4, 2),
+        (15.0, 15.0, 1e-4, 2),
         pytest.param(60.0, 15.0, 1e-4, 30, marks=pytest.mark.slow),
         pytest.param(20.0, 20.0, 1e-3, 30, marks=pytest.mark.slow),
         pytest.param(22.5, 40.0, 1e-4, 30, marks=pytest.mark.slow),

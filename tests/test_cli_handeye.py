@@ -327,7 +327,7 @@ def test_images_and_a_robots_file(run: Run, photos: Path, tmp_path: Path) -> Non
 def recorded(folder: Path, setup: str, dt: float = 0.0) -> tuple[Path, Path, Path, Path]:
     """A corner file and a robot's stream of a moving rig, on clocks dt apart: t_robot = t_cam + dt."""
     rng = np.random.default_rng(11)
-    t = np.arange(0, 20, 0.05)
+    t = np.arange(0, 10, 0.1)
     middle = random_board_poses(CAMERA, BOARD, 1, rng, max_tilt=0.1, max_roll=0.1, fill=(0.45, 0.5))[0]
 
     def seen(t: Array) -> Array:
@@ -339,7 +339,7 @@ def recorded(folder: Path, setup: str, dt: float = 0.0) -> tuple[Path, Path, Pat
     lines = [f"{s},{c // 4},{c % 4},{u:.5f},{v:.5f}" for s, c, (u, v) in zip(stamps, views.corner, views.uv, strict=True)]
     corners = folder / "corners.csv"
     corners.write_text("\n".join(["t [ns],tag_id,corner_idx,u [px],v [px]", *lines]) + "\n")
-    s = np.arange(0, 20, 0.01)
+    s = np.arange(0, 10, 0.02)
     T = Z @ se3.inverse(seen(s)) @ se3.inverse(X) if setup == "eye-in-hand" else X @ seen(s) @ se3.inverse(Z)
     T = noisy(T, rng, 1e-4, 1e-4)
     robot = folder / "robot.csv"
@@ -370,7 +370,7 @@ def test_two_streams_of_poses_on_clocks_minutes_apart(run: Run, tmp_path: Path) 
     rng = np.random.default_rng(12)
 
     def stream(path: Path, fixed: Array, rate: float, start: float) -> Path:
-        t = np.arange(0, 30, 1 / rate)
+        t = np.arange(0, 12, 1 / rate)
         turn = np.stack([0.8 * np.sin(1.7 * t), 0.7 * np.sin(2.3 * t + 1), 0.9 * np.sin(1.3 * t + 2)], axis=1)
         T = se3.make(so3.exp(turn), 0.3 * np.stack([np.sin(1.1 * t), np.sin(1.9 * t), np.sin(0.7 * t)], axis=1))
         T = noisy(T if fixed is None else se3.inverse(Z) @ T @ fixed, rng)
@@ -380,7 +380,7 @@ def test_two_streams_of_poses_on_clocks_minutes_apart(run: Run, tmp_path: Path) 
         )
         return path
 
-    vicon, vio = stream(tmp_path / "vicon.txt", se3.inverse(np.eye(4)), 100, 0.0), stream(tmp_path / "vio.txt", X, 30, -400.0)
+    vicon, vio = stream(tmp_path / "vicon.txt", se3.inverse(np.eye(4)), 50, 0.0), stream(tmp_path / "vio.txt", X, 10, -400.0)
     out = tmp_path / "rig.yaml"
     said = run(vicon, vio, "--pose", "hand=vicon", "--pose", "head=vio", "-o", out)
     assert said.code == 0, said
@@ -397,7 +397,7 @@ def test_tf_frames_name_the_transform(run: Run, tmp_path: Path) -> None:
     messages = [("/tf", t, make.tf((t, "base_link", "tool0", row[1:4], row[4:]))) for t, row in zip(stamps, values, strict=True)]
     bag = write(tmp_path, "ros1", messages)
     out = tmp_path / "rig.yaml"
-    said = run(bag, corners, "--pose", "tf:base_link/tool0", "--target", target, "--rig", rig, "-o", out)
+    said = run(bag, corners, "--pose", "tf:base_link/tool0", "--setup", "eye-in-hand", "--target", target, "--rig", rig, "-o", out)
     assert said.code == 0, said
     assert_near(out, "T_tool0_cam0")
     assert "T_baselink_target" in load_rig(out).transforms
@@ -469,3 +469,50 @@ def test_kuka_from_images_to_the_published_figures(run: Run, data_dir: Path, tmp
     assert np.degrees(found["scatter"]["angle"]) < 1.05 * 0.047
     assert found["methods"]["andreff"]["failed"]
     assert re.search(r"^andreff .*FAILED$", said.out, re.MULTILINE)
+
+
+def clocks(rig: Path, name: str) -> tuple[float, float]:
+    offset = load_rig(rig).time_offsets[name].offset
+    assert offset.value is not None
+    assert offset.sigma is not None
+    return offset.value, offset.sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["timeoffset", "handeye"])
+def test_three_phones_offsets_of_minutes_close_to_a_loop(run: Run, data_dir: Path, tmp_path: Path, command: str) -> None:
+    streams, dt = data_dir / "pose_streams", {}
+    for a, b in (("CALIGULA", "MARS"), ("MARS", "NERO"), ("CALIGULA", "NERO")):
+        rig = tmp_path / f"{a}{b}.yaml"
+        named = ("--pose", f"{a}=tango_{a}", "--pose", f"{b}=tango_{b}")
+        said = run.func(command, *(streams / f"tango_{name}.csv" for name in (a, b)), *named, "-o", rig)
+        assert said.code == 0, said
+        dt[a + b] = clocks(rig, f"dt_{a}_{b}")[0]
+    np.testing.assert_allclose([dt["CALIGULAMARS"], dt["MARSNERO"], dt["CALIGULANERO"]], [-125.15, -4458.26, -4583.41], atol=0.01)
+    left = dt["CALIGULAMARS"] + dt["MARSNERO"] - dt["CALIGULANERO"]
+    print(f"{command}: the loop closes within {1e3 * left:.2f} ms")
+    assert abs(left) < 0.010
+
+
+@pytest.mark.slow
+def test_both_halves_of_motion_capture_and_camera_give_one_x(run: Run, data_dir: Path, tmp_path: Path) -> None:
+    streams, found = data_dir / "pose_streams", []
+    lines = (streams / "camera_in_target.csv").read_text().splitlines()
+    for k, part in enumerate((lines[: len(lines) // 2], lines[len(lines) // 2 :])):
+        (tmp_path / str(k)).mkdir()
+        half, rig = tmp_path / str(k) / "camera_in_target.csv", tmp_path / f"{k}.yaml"
+        half.write_text("\n".join(part) + "\n")
+        said = run(
+            data_dir / "pose_streams" / "vicon_hand.csv", half, "--pose", "hand=vicon_hand", "--pose", "cam=camera_in_target", "-o", rig
+        )
+        assert said.code == 0, said
+        dt, sigma = clocks(rig, "dt_hand_cam")
+        assert 0.015 - 3 * sigma < dt < 0.023 + 3 * sigma
+        assert sigma < 4e-3
+        entry = load_rig(rig).transforms["T_hand_cam"]
+        assert entry.covariance is not None
+        found.append((np.array(entry.matrix), np.array(entry.covariance.matrix), dt))
+    (one, cov_one, _), (two, cov_two, _) = found
+    apart = se3.local(one, two) / np.sqrt(np.diag(cov_one + cov_two))
+    print("halves apart by", apart.round(2), "sigmas; dt", [1e3 * f[2] for f in found])
+    assert np.abs(apart).max() < 3

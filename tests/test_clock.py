@@ -1,13 +1,21 @@
 """td over time: a constant clock is not taken for another, drifts and jumps are found with honest sigmas, and said in words."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from time_offset_samples import path, pose_imu
+from time_offset_samples import Sample, path, pose_imu
 
+from calibkit.data.rig import Estimate, Rig
+from calibkit.data.transforms import make_time_offset
 from calibkit.estimation.clock import Clock, describe, fit_clock
+from calibkit.estimation.stamps import check_stamps
+from calibkit.estimation.time_offset import TimeOffsetFit
+from calibkit.estimation.time_offset_delay import Delays
+from calibkit.estimation.time_offset_result import Pair, time_offset_result
+from calibkit.report.view import views
 
 Scatter = Callable[[np.random.Generator, int], np.ndarray]
 
@@ -147,15 +155,15 @@ def test_a_skew_that_changes_with_temperature_is_no_staircase(drift: Callable[[n
         assert _rms(list(clock.at(t) - 0.006 - drift(t))) < 1e-4
         rates = np.gradient(drift(t), t)
         assert clock.skew_range == pytest.approx((rates.min(), rates.max()), abs=6e-6)
-        assert "ppm, from " in describe(clock)[0]
+        assert "ppm, from " in describe(clock, "imu0")[0]
 
 
 def test_many_drops_are_many_jumps() -> None:
     clock = _clock(60, 60, 1e-4, 0, jumps=tuple((5.0 * k, -0.05) for k in range(1, 12)))
     assert len(clock.jumps) == 11
-    said = describe(clock, 20.0)
+    said = describe(clock, "imu0", 20.0)
     assert len(said) == 5
-    assert said[0].endswith("ms at 5.0 s (1 frame period of 20 Hz: dropped frames or a driver's re-sync)")
+    assert said[0].endswith("ms at 5.0 s after the first sample of imu0 (1 frame period of 20 Hz: dropped frames or a driver's re-sync)")
     assert said[-1] == "7 more jumps, of -50.0 to -49.9 ms, the last at 55.0 s"
 
 
@@ -164,50 +172,82 @@ def test_few_windows_are_too_short_to_tell() -> None:
         t, start, end = _windows(w, 10)
         clock = fit_clock(t, start, end, 0.03 * np.arange(w), np.full(w, 1e-4))
         assert (clock.kind, clock.too_short, clock.jumps, clock.skew) == ("constant", True, (), 0)
-        assert describe(clock)[0].startswith("too short to tell whether the clocks drift or jump: ")
+        assert describe(clock, "imu0")[0].startswith("too short to tell whether the clocks drift or jump: ")
     with pytest.raises(ValueError, match="needs windows"):
         fit_clock(*np.zeros((5, 0)))
 
 
 def test_words() -> None:
-    (said,) = describe(_clock(60, 60, 5e-5, 0, skew=50e-6))
+    (said,) = describe(_clock(60, 60, 5e-5, 0, skew=50e-6), "imu0")
     assert said == "the clock drifts: td changes by +49.9 +- 0.3 ppm (+2.99 ms over 60 s)"
-    drift, jump = describe(_clock(60, 60, 5e-5, 0, -50e-6, ((30.1, 0.05),)), 20.0)
+    drift, jump = describe(_clock(60, 60, 5e-5, 0, -50e-6, ((30.1, 0.05),)), "imu0", 20.0)
     assert drift.startswith("the clock drifts: td changes by -5")
-    assert (
-        jump == "the clock jumps: td changes by +50.01 +- 0.02 ms at 30.5 s (1 frame period of 20 Hz: dropped frames or a driver's re-sync)"
+    assert jump == (
+        "the clock jumps: td changes by +50.01 +- 0.02 ms at 30.5 s after the first sample of imu0 "
+        "(1 frame period of 20 Hz: dropped frames or a driver's re-sync)"
     )
-    (other,) = describe(_clock(60, 60, 5e-5, 0, 0.0, ((30.1, 0.033),)), 20.0)
+    (other,) = describe(_clock(60, 60, 5e-5, 0, 0.0, ((30.1, 0.033),)), "imu0", 20.0)
     assert other.endswith("(dropped frames or a driver's re-sync)")
     constant = _clock(60, 60, 5e-5, 0)
-    (said,) = describe(constant)
+    (said,) = describe(constant, "imu0")
     limit = constant.skew_limit * 1e6
     assert said == f"the clocks keep step: no jump, and a drift is below {limit:.2g} ppm ({limit * 0.06:.2g} ms over 60 s)"
     assert 0 < limit < 3
     worse = _clock(360, 60, 5e-5, 0, scatter=lambda rng, w: 2 * rng.normal(size=w))
     assert worse.scatter == pytest.approx(2, rel=0.15)
-    assert describe(worse)[-1] == f"td of the windows scatters {worse.scatter:.1f} times as much as their sigmas say"
+    assert describe(worse, "imu0")[-1] == f"td of the windows scatters {worse.scatter:.1f} times as much as their sigmas say"
 
 
-def test_frames_that_a_driver_lost_are_found_to_the_frame() -> None:
+@pytest.fixture(scope="module")
+def lost() -> tuple[Sample, TimeOffsetFit]:
     """Stamps counted on at 20 Hz: each lost frame makes them late by 50 ms more, in all further than the V reaches; and they drift."""
     sample = pose_imu(path(0), 0, 0.0123, 1e-3, 60.0)
-    t_ns = sample.turns.t_ns
+    stamps = sample.of_t_ns + np.round(_late(sample.of_t_ns) * 1e9).astype(np.int64)
+    sample = replace(sample, turns=replace(sample.turns, t_ns=stamps), of_t_ns=stamps)
+    return sample, sample.fitted
+
+
+def _late(t_ns: np.ndarray) -> np.ndarray:
     since = (t_ns - t_ns[0]) * 1e-9
-    late = 20e-6 * since + 0.05 * (since >= 20) + 0.05 * (since >= 42)
-    stamps = t_ns + np.round(late * 1e9).astype(np.int64)
-    fit = replace(sample, turns=replace(sample.turns, t_ns=stamps)).fitted
+    return 20e-6 * since + 0.05 * (since >= 20) + 0.05 * (since >= 42)
+
+
+def test_frames_that_a_driver_lost_are_found_to_the_frame(lost: tuple[Sample, TimeOffsetFit]) -> None:
+    sample, fit = lost
     clock, a = fit.clock, fit.alignment
     assert clock is not None
     assert clock.kind == "jumping"
-    t = (stamps + fit.coarse_ns - a.track.origin_ns) * 1e-9
-    lost = np.flatnonzero(np.diff(since >= 20) | np.diff(since >= 42))
+    late = _late(pose_imu(path(0), 0, 0.0123, 1e-3, 60.0).of_t_ns)
+    t = (sample.of_t_ns + fit.coarse_ns - a.track.origin_ns) * 1e-9
     assert len(clock.jumps) == 2
-    for jump, k in zip(clock.jumps, lost, strict=True):
+    for jump, k in zip(clock.jumps, np.flatnonzero(np.diff(late) > 0.04), strict=True):
         assert jump.size_s == pytest.approx(-0.05, abs=4 * jump.sigma_s)
         assert t[k] < jump.t_s < t[k + 1]
         assert jump.t_sigma_s < 0.05
-    wrong = fit.coarse_ns * 1e-9 + a.shift(t) - (0.0123 - late)
+    wrong = fit.coarse_ns * 1e-9 + a.shift(t) - (sample.td - late)
     assert np.abs(wrong).max() < 4 * (fit.sigma + 30 * clock.skew_sigma + sum(jump.sigma_s for jump in clock.jumps))
     assert fit.sigma < 5e-5  # as without them
     assert a.turns > 0.99 * fit.n_turns
+
+
+def test_a_jump_is_named_in_frames_with_its_time_and_in_the_direction_that_it_is_stored(lost: tuple[Sample, TimeOffsetFit]) -> None:
+    sample, fit = lost
+    stamps = {"cam0": check_stamps(sample.of_t_ns), "imu0": check_stamps(sample.reference.t_ns)}
+    pair = Pair("cam0", "imu0", "/cam0", "/imu0", "poses")
+    turned = Rig(time_offsets={"dt_cam0_imu0": make_time_offset("cam0", "imu0", Estimate(value=0.0, unit="s"))})
+    for base, about in ((Rig(), ""), (turned, "of dt_imu0_cam0, which is minus this: ")):
+        result = time_offset_result(pair, fit, base, stamps, Delays(), None)
+        (entry,) = result.rig.time_offsets.values()
+        said = re.fullmatch(
+            rf"{about}the clock jumps: td changes by -50\.\d \+- \d\.\d ms at (\S+) s after the first sample of imu0 "
+            r"\(1 frame period of 20 Hz: dropped frames or a driver's re-sync\); one number does not hold throughout",
+            entry.reasons[0],
+        )
+        assert said, entry.reasons
+        assert float(said[1]) == pytest.approx(1.0123 + 20.0, abs=0.1)  # poses begin 1.0123 s after the IMU
+        turns, _, windows = views(result)
+        assert min(turns.t) == pytest.approx(1.0123 + 0.025, abs=0.06)  # the report's axis has the same zero
+        assert windows.zeroed
+        lines = "\n".join(map(str, result.facts["lines"]))  # type: ignore[call-overload]
+        assert ("the rig file has it the other way round: t_cam0 = t_imu0 + dt_cam0_imu0" in lines) is bool(about)
+        assert re.search(r"this td is that of \d\d\.\d s after the first sample of imu0", lines)

@@ -205,6 +205,18 @@ def test_a_step_of_the_clock_is_marked_with_its_size_and_a_drift_in_ppm():
     assert len(figure.axes) == 1
 
 
+def test_times_count_from_the_zero_that_the_stage_gives():
+    made = result(**CASES["jump"])
+    for zero, label, later in ((START_NS - 10**9, "sample of imu0", 2.0), (None, "turn of cam0", 0.0), ("0", "turn of cam0", 0.0)):
+        zeroed = replace(made, facts={**made.facts, "t_zero_ns": {SENSOR: zero}})
+        for key in ("offset_over_time", "rates"):
+            said, figure = texts(zeroed, key)
+            assert f"s after the first {label}" in said
+            if key == "offset_over_time":
+                (step,) = [line for line in figure.axes[0].lines if line.get_linestyle() == "--" and line.get_color() == ACCENT]
+                assert step.get_xdata()[0] == pytest.approx(32.5 - 1 + later, abs=0.03)
+
+
 def test_growth_is_found_with_its_size_and_noise_has_none():
     """|residual| = 0.1 + 0.05 x with noise of 0.02: 100 seeds, the slope's sigma holds; without, it is chance."""
     z = []

@@ -23,6 +23,7 @@ _SIGNIFICANT = 4.0  # sigmas: the price of a skew
 _WORSE = 1.3  # scatter that is worth telling
 _MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 _JUMPS_TOLD = 5  # one by one
+_HUNDREDTHS = 0.05  # s
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,11 @@ class Jump:
     t_sigma_s: float  # of a uniform distribution over it
     size_s: float  # after minus before
     sigma_s: float
+
+    @property
+    def when(self) -> str:
+        """Its time to hundredths where they are known, else to tenths."""
+        return f"{self.t_s:.{2 if self.t_sigma_s < _HUNDREDTHS else 1}f} s"
 
 
 @dataclass(frozen=True)
@@ -146,8 +152,11 @@ def _interval(windows: Windows, fit: Fit, k: int) -> tuple[float, float]:
     return float(windows.t_s[before]), float(windows.t_s[after])
 
 
-def describe(clock: Clock, frame_hz: float | None = None) -> list[str]:
-    """Return what there is to say of the clock, td = t_to - t_of; jumps by whole frame periods are named where the rate is given."""
+def describe(clock: Clock, to: str, frame_hz: float | None = None) -> list[str]:
+    """Return what there is to say of the clock, td = t_to - t_of, its times counted from the first sample of `to`.
+
+    Jumps by whole frame periods are named where the rate of the stamps of `of` is given.
+    """
     if clock.too_short:
         return [f"too short to tell whether the clocks drift or jump: {counted(clock.n_windows, 'window')} of td, {FEWEST} are needed"]
     said = []
@@ -160,9 +169,9 @@ def describe(clock: Clock, frame_hz: float | None = None) -> list[str]:
     for jump in told:
         cause = _frames(jump, frame_hz) or "dropped frames or a driver's re-sync"
         size = _with_sigma(jump.size_s * 1e3, jump.sigma_s * 1e3)
-        said.append(f"the clock jumps: td changes by {size} ms at {jump.t_s:.1f} s ({cause})")
+        said.append(f"the clock jumps: td changes by {size} ms at {jump.when} after the first sample of {to} ({cause})")
     if others := [jump.size_s * 1e3 for jump in clock.jumps[len(told) :]]:
-        said.append(f"{len(others)} more jumps, of {min(others):+.1f} to {max(others):+.1f} ms, the last at {clock.jumps[-1].t_s:.1f} s")
+        said.append(f"{len(others)} more jumps, of {min(others):+.1f} to {max(others):+.1f} ms, the last at {clock.jumps[-1].when}")
     if not said:
         limit = f"{clock.skew_limit * 1e6:.2g} ppm ({clock.skew_limit * clock.span_s * 1e3:.2g} ms over {clock.span_s:.4g} s)"
         said.append(f"the clocks keep step: no jump, and a drift is below {limit}")

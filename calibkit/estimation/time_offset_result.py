@@ -52,13 +52,19 @@ def time_offset_result(
     a, b, key = (pair.of, pair.to, f"dt_{pair.of}_{pair.to}") if flipped else (pair.to, pair.of, name)
     if flipped and offset.value is not None:
         offset = offset.model_copy(update={"value": -offset.value})
-    entry = make_time_offset(a, b, offset, verdict=worst(reasons), reasons=[reason.text.removeprefix(f"{name}: ") for reason in reasons])
+    about = f"of {name}, which is minus this: " if flipped else ""  # signs and the other td's in a reason are those of t_to = t_of + td
+    texts = [
+        f"{about}{reason.text.removeprefix(prefix)}" if reason.text.startswith(prefix := f"{name}: ") else reason.text for reason in reasons
+    ]
+    entry = make_time_offset(a, b, offset, verdict=worst(reasons), reasons=texts)
+    turned = f"  the rig file has it the other way round: {entry.equation}, {key} = -td"
     low, high = (fit.coarse_ns * 1e-9 + end for end in fit.interval)
     told = {"offset": fit.td, "sigma": sigma, "low": low, "high": high, "second": fit.second}
     facts = {
         "v": {name: told if known else dict.fromkeys(told)},
         "time_offset": {name: _facts(pair, fit, delays, bootstrap) if known else {"method": pair.method}},
-        "lines": _lines(pair, fit, delays, bootstrap, known),
+        "t_zero_ns": {name: fit.alignment.track.origin_ns - fit.coarse_ns},
+        "lines": [*_lines(pair, fit, stamps[pair.of].rate_hz, delays, bootstrap, known), *([turned] if flipped and known else [])],
     }
     return Result(
         stage="timeoffset",
@@ -84,7 +90,7 @@ def smear(rate: float, td: float, focal_px: float | None) -> str:
     return f"{focal_px * angle:.2g} px" if focal_px else f"{angle * 1e3:.2g} mrad"
 
 
-def _lines(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | None, known: bool) -> list[str]:
+def _lines(pair: Pair, fit: TimeOffsetFit, frame_hz: float | None, delays: Delays, bootstrap: float | None, known: bool) -> list[str]:
     a, (middle, fast) = fit.alignment, rates(fit)
     duration = sum(float(part.stretch.turns.duration.sum()) for part in a.parts)
     span = a.stretches[-1].t[-1] - a.stretches[0].t[0]
@@ -108,7 +114,9 @@ def _lines(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
         left = smear(fast, fit.sigma, pair.focal_px)
         lines.append(f"  left uncorrected it costs {' and '.join(costs)}; once corrected its sigma still costs {left}")
     if fit.clock is not None:
-        lines += [f"  {text}" for text in describe(fit.clock)]
+        lines += [f"  {text}" for text in describe(fit.clock, pair.to, frame_hz)]
+        if fit.clock.kind != "constant":
+            lines.append(f"  this td is that of {fit.clock.t_ref_s:.1f} s after the first sample of {pair.to}")
     lines += [f"  {text}" for text in delays.told(pair.of, pair.to, fit.td)]
     if len(a.R) == 3:
         v = np.degrees(so3.log(a.R))
@@ -139,6 +147,7 @@ def _facts(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
         "stamp_jitter": float(np.sqrt(a.levels.jitter)),
         "axis_offsets": (fit.td + off).tolist(),
         "axis_sigmas": np.sqrt(np.diag(off_cov)).tolist(),
+        "t_zero": f"the first sample of {pair.to}: what t of windows and clock counts from, in s",
         "windows": {
             "t": ((fit.windows.start + fit.windows.stop) / 2)[known].tolist(),
             "td": (fit.coarse_ns * 1e-9 + fit.windows.tau[known]).tolist(),
@@ -148,9 +157,10 @@ def _facts(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
         if clock is None
         else {
             "kind": clock.kind,
+            "t_of_td": clock.t_ref_s,
             "skew": clock.skew,
             "skew_sigma": clock.skew_sigma if np.isfinite(clock.skew_sigma) else None,
-            "jumps": [{"t": jump.t_s, "size": jump.size_s, "sigma": jump.sigma_s} for jump in clock.jumps],
+            "jumps": [{"t": jump.t_s, "t_sigma": jump.t_sigma_s, "size": jump.size_s, "sigma": jump.sigma_s} for jump in clock.jumps],
         },
         "delays": delays.facts(),
     }

@@ -59,7 +59,8 @@ def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: d
     reasons = []
     if known == "weak":
         reasons.append(Reason(Verdict.CHECK, f"{name}: weak: known to {fit.sigma * 1e3:.2g} ms only; {_advice(fit)}"))
-    reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in _doubts(of, to, fit)]
+    frame_hz = stamps[of].rate_hz if of in stamps else None
+    reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in _doubts(of, to, fit, frame_hz)]
     return Judged(Status(known), (*reasons, *scale, *spoilt))
 
 
@@ -86,7 +87,7 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
             )
         return f"the rate of turn hardly changes (about {middle:.2g} rad/s): a constant rate fits every offset alike; {_MOTION}"
     if not 1 < int(np.argmin(fit.cost)) < len(fit.cost) - 2:
-        return f"the V has no bottom within {fit.tau[-1] * 1e3:.0f} ms of {fit.td * 1e3:+.1f} ms: the two streams do not fit together"
+        return f"the V has no bottom within {np.ptp(fit.tau) * 500:.0f} ms of {fit.td * 1e3:+.1f} ms: the two streams do not fit together"
     if fit.second is not None:
         both = f"{fit.second * 1e3:+.3f} ms fits as well as {fit.td * 1e3:+.3f} ms"
         return f"{both}: the motion repeats itself; turn irregularly, about several axes"
@@ -110,7 +111,7 @@ def _advice(fit: TimeOffsetFit) -> str:
     )
 
 
-def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
+def _doubts(of: str, to: str, fit: TimeOffsetFit, frame_hz: float | None) -> list[tuple[Verdict, str]]:
     found = []
     td = fit.td * 1e3
     if fit.by_fast_turns is not None:
@@ -121,8 +122,7 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     clock = fit.clock
     if clock is not None and clock.kind != "constant":
         verdict = Verdict.FAIL if clock.jumps else Verdict.CHECK
-        rate = 1 / float(np.median(np.concatenate([part.stretch.turns.duration for part in fit.alignment.parts])))
-        found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, rate)]
+        found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, to, frame_hz)]
     if fit.alignment.levels.jitter > _JITTER_S**2:
         jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
         found.append(

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from calibkit.report.growth import growth
 from calibkit.report.look import ACCENT, INK
-from calibkit.report.time_offset_figures import limits, names
+from calibkit.report.time_offset_figures import limits, names, since
 from calibkit.report.view import Array, Index, View, given
 
 BUSIEST_S = 6.0
@@ -40,7 +40,7 @@ def rates(figure: Figure, view: View) -> None:
         lower.axhline(0, color="black", lw=0.7)
         lower.plot(x, lines[:, 1], ".-", color=INK, ms=3.5, lw=0.8)
         upper.set_title(title)
-        lower.set_xlabel(f"time of {b} since its start (s)")
+        lower.set_xlabel(since(view))
     axes[0, 0].set(ylabel="|ω| (rad/s)", ylim=(low, high))
     differences = [of[good] - rate[good] for rate, _ in panels]
     axes[1, 0].set(ylabel=f"{b} - {a} (rad/s)", ylim=limits([*differences, *(-d for d in differences)]))

@@ -132,7 +132,7 @@ def offset_over_time(figure: Figure, view: View) -> None:
     if not sure.all():
         said.append(f"pale: {counted(int(np.sum(~sure)), 'window')} of large sigma")
     panels[0].set(ylabel=axis.label("td"), title="; ".join(said))
-    panels[-1].set_xlabel(f"time of {names(view)[1]} since its start (s)")
+    panels[-1].set_xlabel(since(view))
     if moves:
         left = view.raw[order, 0]
         around = Seconds(0.0, axis.unit)
@@ -165,6 +165,12 @@ def _clock(panel: Axes, t: Array, clock: Array, sigma: Array, axis: Seconds) -> 
         return "too few windows to tell whether the clocks drift"
     drift = "the clocks run alike" if abs(skew) < 1e-8 else f"the clocks drift apart by {1e6 * skew:+.3g} ppm"
     return drift + (f", with {counted(len(ends), 'step')} (dashed)" if len(ends) else "")
+
+
+def since(view: View) -> str:
+    """Return the label of an axis of time."""
+    a, b = names(view)
+    return f"s after the first {f'sample of {a}' if view.zeroed else f'turn of {b}'}"
 
 
 def names(view: View) -> tuple[str, str]:

@@ -58,7 +58,8 @@ class View:
     high: Array | None = None
     attitude: Array | None = None  # (n, 3) unit vector of gravity's reaction in the IMU's frame
     noise: Mapping[ImuAxis, Noise] = field(default_factory=dict)  # of an IMU, by axis
-    t: Array | None = None  # (n,) s since the first residual of this sensor
+    t: Array | None = None  # (n,) s since the stage's own zero, or since the first residual of this sensor
+    zeroed: bool = False  # whether the stage gave a zero
     rate: Array | None = None  # (n,) rad/s |omega| of `a` of dt_a_b, at b's stamps plus the offset; here and below NaN where unknown
     rate_before: Array | None = None  # (n,) rad/s the same at b's stamps as they are
     of_rate: Array | None = None  # (n,) rad/s |omega| of `b`
@@ -181,6 +182,7 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         high=floats("high"),
         attitude=floats("attitude", 3),
         t=_seconds(result, residuals)[good],
+        zeroed=_zero(result, residuals.sensor) is not None,
         rate=partly("rate"),
         rate_before=partly("rate_before"),
         of_rate=partly("of_rate"),
@@ -200,9 +202,17 @@ def _view(result: Result, residuals: ResidualSet) -> View:
 
 
 def _seconds(result: Result, residuals: ResidualSet) -> Array:
-    """Return the rows' times since the first residual of the sensor; as floats (to 256 ns), because a stranger's stamps may overflow."""
+    """Return the rows' times since the sensor's zero or first residual; as floats (to 256 ns), because a stranger's stamps may overflow."""
     firsts = [float(r.t_ns.min()) for r in result.residuals if r.sensor == residuals.sensor and len(r.t_ns) and "delay" not in r.context]
-    return (residuals.t_ns.astype(float) - min(firsts, default=0.0)) * 1e-9
+    zero = _zero(result, residuals.sensor)
+    return (residuals.t_ns.astype(float) - (min(firsts, default=0.0) if zero is None else zero)) * 1e-9
+
+
+def _zero(result: Result, sensor: str) -> float | None:
+    """Return facts["t_zero_ns"][sensor], from where the stage counts its times."""
+    by_sensor = result.facts.get("t_zero_ns")
+    zero = by_sensor.get(sensor) if isinstance(by_sensor, Mapping) else None
+    return float(zero) if isinstance(zero, int) and abs(zero) < 2**63 else None
 
 
 def _bottom(result: Result, sensor: str) -> Bottom | None:

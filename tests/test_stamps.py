@@ -10,6 +10,7 @@ from calibkit.simulation.scenarios import SCENARIOS
 from calibkit.simulation.session import simulate_session
 
 T0 = 1_700_000_000_000_000_000
+RNG = np.random.default_rng
 
 
 def _stamps(n: int, hz: float, jitter_s: float = 0.0, drops: float = 0.0, seed: int = 0) -> tuple[np.ndarray, int]:
@@ -59,7 +60,7 @@ def test_faults_of_a_recording_are_named_with_their_size() -> None:
         return found, describe(found)
 
     found, said = report("image-drops-30")
-    assert said == [f"{100 * found.missing_share:.2g} % of the frames are missing ({found.missing} of {found.expected}), the rate is 10 Hz"]
+    assert said == [f"{100 * found.missing_share:.3g} % of the frames are missing ({found.missing} of {found.expected}), the rate is 10 Hz"]
     assert found.missing_share == pytest.approx(0.3, abs=0.1)
     assert found.expected <= n
     found, said = report("image-jitter-2")
@@ -114,3 +115,38 @@ def test_order_does_not_matter_and_is_told() -> None:
     report = check_stamps(swapped)
     assert (report.backward, report.jitter_s) == (1, check_stamps(t_ns).jitter_s)
     assert "1 stamp goes back in time" in describe(report)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "off"),
+    [(7200.0, "1.99 h"), (-7200.0, "1.99 h"), (300.0, "4.5 min"), (-50.0, "20 s"), (-T0 * 1e-9 + 1, "53.9 years"), (-9e9, "285 years")],
+)
+def test_a_wild_stamp_is_named_and_no_other_is_missing(seconds: float, off: str) -> None:
+    """It stays out of the grid: of 1.44 million ticks in two hours 99 % would be missing."""
+    t_ns, _ = _stamps(12000, 200)
+    t_ns[6000] += np.int64(seconds * 1e9)
+    report = check_stamps(t_ns)
+    assert (report.far, report.missing, report.backward, report.rate_hz) == (1, 0, 0, pytest.approx(200))
+    assert describe(report, "sample") == [f"1 sample has a stamp {off} off all others"]
+    assert report.jitter_s == pytest.approx(0, abs=1e-8)
+
+
+def test_some_wild_stamps_are_counted_and_a_pause_or_a_sparse_stream_has_none() -> None:
+    t_ns, _ = _stamps(2000, 20, 2e-3)
+    t_ns[[5, 6, 900]] += 300_000_000_000_000
+    assert describe(check_stamps(t_ns))[0] == "3 frames have stamps up to 3.47 days off all others"
+    paused, _ = _stamps(2000, 20)
+    paused[1000:] += 3_600_000_000_000
+    assert check_stamps(paused).far == 0
+    waits = T0 + np.cumsum(RNG(0).exponential(20.0, 60) * 1e9).astype(np.int64)
+    assert check_stamps(waits).far == 0
+
+
+def test_numbers_are_plain() -> None:
+    """Nobody reads 1e+02 %."""
+    t_ns, _ = _stamps(2000, 20)
+    t_ns[1000:] += 36_000_000_000_000
+    assert describe(check_stamps(t_ns)) == ["99.7 % of the frames are missing (720000 of 722000), the rate is 20 Hz"]
+    slow, _ = _stamps(400, 0.5, 0.15)
+    (text,) = describe(check_stamps(slow))
+    assert text == "stamps jitter by 150 +- 5 ms rms around a regular grid, the rate is 0.5 Hz"

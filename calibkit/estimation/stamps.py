@@ -18,6 +18,8 @@ _LEAST = 10  # stamps; fewer are no grid
 _BLOCK = 32  # stamps that share a phase
 _MANY = 20_000  # intervals that are enough to tell the period
 _UNSET_S = 1000.0  # a zero stamp so far before all others is none
+_ALONE_S, _ALONE = 1.0, 100.0  # seconds and median intervals: few stamps with longer pauses on either side are wrong
+_FEW, _FEW_SHARE = 3, 0.01  # at once, and of all
 _LONG_S, _LONG = 1.0, 1e-3  # intervals above both, the second a share of the duration, are gaps of the recording
 _FINEST, _COARSEST = 1 / 8, 2.0  # of the median interval: periods that are tried
 _ALIKE = 0.8  # of the best coherence; a multiple of the best period that is as coherent is the period
@@ -36,6 +38,8 @@ class StampReport:
     empty: int | None  # ticks of the grid without a stamp, from the first stamp to the last
     duplicates: int  # stamps that another frame has, too
     zeros: int  # stamps that are not set
+    far: int  # stamps far off all others, such as those of another clock
+    far_s: float  # by how much, at most
     backward: int  # stamps before the one before
     jitter_s: float | None  # rms of the stamps around the grid
     jitter_sigma_s: float | None
@@ -47,8 +51,8 @@ class StampReport:
 
     @property
     def missing(self) -> int:
-        """Ticks without a frame, 0 where that is not known: a frame with a repeated or zero stamp was one, too."""
-        return max(0, (self.empty or 0) - self.duplicates - self.zeros)
+        """Ticks without a frame, 0 where that is not known: a frame with a repeated, zero or wild stamp was one, too."""
+        return max(0, (self.empty or 0) - self.duplicates - self.zeros - self.far)
 
     @property
     def expected(self) -> int:
@@ -64,6 +68,8 @@ def check_stamps(t_ns: Times) -> StampReport:
     """Return what the stamps (n,) of a stream, in the order of the recording, say of themselves."""
     zeros = _unset(t_ns)
     stamps = t_ns[~zeros]
+    far, far_s = _far_off(stamps)
+    stamps = stamps[~far]
     ordered = np.sort(stamps)
     unique = ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
     backward = int(np.sum(np.diff(stamps) < 0))
@@ -79,13 +85,43 @@ def check_stamps(t_ns: Times) -> StampReport:
         else:
             empty = max(0, ticks - len(unique))
             jitter, sigma = _jitter(t_s, period, offset)
-    return StampReport(len(t_ns), period, empty, len(stamps) - len(unique), int(np.sum(zeros)), backward, jitter, sigma, bursts)
+    return StampReport(
+        count=len(t_ns),
+        period_s=period,
+        empty=empty,
+        duplicates=len(stamps) - len(unique),
+        zeros=int(np.sum(zeros)),
+        far=int(np.sum(far)),
+        far_s=far_s,
+        backward=backward,
+        jitter_s=jitter,
+        jitter_sigma_s=sigma,
+        bursts=bursts,
+    )
 
 
 def _unset(t_ns: Times) -> NDArray[np.bool_]:
     zero = t_ns == 0
     others = t_ns[~zero]
     return zero if len(others) == 0 or np.min(np.abs(others)) > _UNSET_S * 1e9 else np.zeros(len(t_ns), np.bool_)
+
+
+def _far_off(t_ns: Times) -> tuple[NDArray[np.bool_], float]:
+    """Return which stamps (n,) lie alone or nearly so, far off all others, and how far at most, s."""
+    order = np.argsort(t_ns, kind="stable")
+    steps = np.diff(t_ns[order].astype(float)) * 1e-9  # of any int64 without overflow
+    far: NDArray[np.bool_] = np.zeros(len(t_ns), np.bool_)
+    if len(t_ns) < _LEAST:
+        return far, 0.0
+    piece = np.concatenate([[0], np.cumsum(steps > max(_ALONE_S, _ALONE * float(np.median(steps))))])
+    size = np.bincount(piece)
+    far[order] = (size <= _FEW)[piece]
+    if not 0 < far.sum() <= max(_FEW, _FEW_SHARE * len(far)):
+        return np.zeros(len(t_ns), np.bool_), 0.0
+    wild, others = t_ns[far].astype(float), np.sort(t_ns[~far].astype(float))
+    after = np.clip(np.searchsorted(others, wild), 1, len(others) - 1)
+    apart = np.minimum(np.abs(wild - others[after - 1]), np.abs(wild - others[after]))
+    return far, float(apart.max()) * 1e-9
 
 
 def _between_gaps(t_s: Array) -> Array:
@@ -154,16 +190,31 @@ def describe(report: StampReport, noun: str = "frame", from_share: float = 0.0, 
     said = []
     rate = f", the rate is {report.rate_hz:.4g} Hz" if report.rate_hz else ""
     if report.missing and report.missing_share >= from_share:
-        said.append(f"{100 * report.missing_share:.2g} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
+        said.append(f"{_plain(100 * report.missing_share, 3)} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
     if report.duplicates:
         said.append(f"{counted(report.duplicates, f'{noun} has', f'{noun}s have')} the stamp of another")
     if report.zeros:
         said.append(f"{counted(report.zeros, f'{noun} has', f'{noun}s have')} a stamp of zero")
+    if report.far:
+        said.append(f"{counted(report.far, f'{noun} has a stamp', f'{noun}s have stamps up to')} {_long(report.far_s)} off all others")
     if report.backward:
         said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time")
     if report.period_s and report.jitter_s and report.jitter_sigma_s and report.jitter_s > max(_TOLD * report.period_s, from_jitter_s):
-        size = f"{report.jitter_s * 1e3:.2g} +- {report.jitter_sigma_s * 1e3:.1g}"
+        size = f"{_plain(report.jitter_s * 1e3, 2)} +- {_plain(report.jitter_sigma_s * 1e3, 1)}"
         said.append(f"stamps jitter by {size} ms rms around a regular grid{rate if not report.missing else ''}")
     if report.bursts:
         said.append("stamps come in bursts: they are times of arrival, not of the sensor")
     return said
+
+
+def _plain(value: float, digits: int) -> str:
+    """Return a number without an exponent: 150 of 2 digits, not 1.5e+02."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def _long(seconds: float) -> str:
+    """Return a duration in the largest unit that it fills."""
+    for unit, size in (("years", 365.25 * 86400), ("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= size:
+            return f"{_plain(seconds / size, 3)} {unit}"
+    return f"{_plain(seconds, 3)} s"

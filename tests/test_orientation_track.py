@@ -1,14 +1,30 @@
 """The orientation that others are laid against: exact where it can be, late nowhere, unknown across gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from time_offset_samples import SILENT, constant_rate, path, seen_gyro, seen_poses, stamps
+from scipy.stats import chi2
+from time_offset_samples import (
+    SILENT,
+    Sample,
+    any_offset,
+    constant_rate,
+    path,
+    pose_imu,
+    pose_pose,
+    seen_gyro,
+    seen_poses,
+    stamps,
+)
 
 from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.errors import BadInputError
-from calibkit.estimation import orientation_track
+from calibkit.estimation import orientation_track, time_grid
 from calibkit.estimation.orientation_track import OrientationTrack, accumulate, track_of_gyro, track_of_poses
+from calibkit.estimation.turn_comparison import lost_to_gaps, usable
+from calibkit.estimation.turns import Turns, gyro_steps
 from calibkit.geometry import so3
 from calibkit.simulation.session import START_NS
 from calibkit.simulation.trajectory import Trajectory
@@ -97,9 +113,8 @@ def test_a_gyroscopes_steps_are_of_fourth_order() -> None:
     def end(n: int, cross: bool = True) -> Array:
         t_ns = np.round(np.linspace(0, 2e9, n + 1)).astype(np.int64)
         rate = np.array([1.0, -2.0, 0.5]) + (t_ns * 1e-9)[:, None] * np.array([-1.5, 1.0, 2.0])
-        h = np.diff(t_ns)[:, None] * 1e-9
-        steps = h * (rate[:-1] + rate[1:]) / 2
-        q = accumulate(so3.quat_exp(steps + cross * h**2 * np.cross(rate[:-1], rate[1:]) / 12))
+        straight = np.diff(t_ns)[:, None] * 1e-9 * (rate[:-1] + rate[1:]) / 2
+        q = accumulate(so3.quat_exp(gyro_steps(t_ns, rate) if cross else straight))
         out: Array = q[-1]
         return out
 
@@ -238,10 +253,170 @@ def test_stamps_that_are_not_set_are_left_out() -> None:
         assert duration(track) == pytest.approx(4.995)
 
 
-def test_a_grid_beyond_memory_is_refused() -> None:
-    t_ns = np.concatenate([stamps(400, 1), stamps(400, 1) + np.int64(40 * 3600e9)])
-    with pytest.raises(BadInputError, match="span 40 h"):
-        track_of_gyro(gyro(t_ns, np.ones((len(t_ns), 3))))
+HOUR_NS = 3_600_000_000_000
+
+
+@pytest.mark.parametrize("rows", [[0], [400], [999], [0, 1, 999], [500, 501, 502]])
+@pytest.mark.parametrize("hours", [-20, -0.01, 2])
+def test_wild_stamps_are_left_out(rows: list[int], hours: float) -> None:
+    """Few of them, hours or seconds off all others: the track is that of the others, its origin too, and as small."""
+    samples = seen_gyro(path(0), stamps(200, 5), RNG(0))
+    others = np.delete(np.arange(1000), rows)
+    t_ns = samples.t_ns.copy()
+    t_ns[rows] += np.int64(hours * HOUR_NS)
+    found, expected = track_of_gyro(gyro(t_ns, samples.gyro)), track_of_gyro(samples.select(others))
+    assert found.origin_ns == expected.origin_ns
+    np.testing.assert_array_equal(found.q, expected.q)
+    np.testing.assert_array_equal(found.chain, expected.chain)
+    q = seen_poses(path(0), samples.t_ns, 0.0, RNG(0)).q
+    np.testing.assert_array_equal(track_of_poses(poses(t_ns, q)).q, track_of_poses(poses(samples.t_ns[others], q[others])).q)
+
+
+def test_a_clock_of_its_own_with_one_zero_in_front() -> None:
+    samples = seen_gyro(path(0), stamps(200, 5), RNG(0))
+    t_ns = samples.t_ns - samples.t_ns[0] + 5 * HOUR_NS
+    t_ns[0] = 0
+    track = track_of_gyro(gyro(t_ns, samples.gyro))
+    assert track.origin_ns == t_ns[1]
+    assert len(track.q) == 999
+
+
+@pytest.mark.parametrize("poses_too", [True, False])
+def test_a_grid_goes_with_the_samples_and_not_with_their_span(poses_too: bool) -> None:
+    """Three recordings on one clock, hours apart: each as if it were alone, nothing known between them."""
+    truth, one = path(0), stamps(200, 4)
+    starts = [0.0, 1.7 * 3600, 9.1 * 3600]
+    t_ns = np.concatenate([one + np.int64(s * 1e9) for s in starts])
+    if poses_too:
+        q = seen_poses(truth, one, 0.0, RNG(0)).q
+        track, alone = track_of_poses(poses(t_ns, np.tile(q, (3, 1)))), track_of_poses(poses(one, q))
+    else:
+        rate = seen_gyro(truth, one, RNG(0), SILENT).gyro
+        track, alone = track_of_gyro(gyro(t_ns, np.tile(rate, (3, 1)))), track_of_gyro(gyro(one, rate))
+    assert len(track.q) < 3 * len(alone.q) + 150
+    assert track.duration == pytest.approx(starts[-1] + alone.duration)
+    t = inside(alone, 0.05)
+    for k, s in enumerate(starts):
+        turn, expected = (
+            so3.quat_multiply(so3.quat_conjugate(each[:-1]), each[1:]) for each in (track.orientation(s + t), alone.orientation(t))
+        )
+        np.testing.assert_allclose(turn, expected, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(track.rate_at(s + t), alone.rate_at(t), rtol=0, atol=1e-4)
+        assert set(track.chain_at(s + t).tolist()) == {0 if poses_too else k}
+        points = np.abs(track.grid.t - s - 2) < 1.9
+        np.testing.assert_allclose(track.grid.place(track.grid.t[points]), np.flatnonzero(points), rtol=0, atol=1e-6)
+    assert set(track.chain_at(np.linspace(4.01, starts[1] - 0.01, 500)).tolist()) == {-1}
+    assert set(track.chain_at(np.array([-1.0, track.duration + 0.001, 1e9])).tolist()) == {-1}
+    ends = START_NS + np.round(np.array([1.0, 1.3, 3.9, 4.2, 3000.0, 3000.3, starts[1] + 1.0, starts[1] + 1.3]) * 1e9).astype(np.int64)
+    turns = Turns(ends, np.arange(7), np.arange(1, 8), np.zeros((7, 3)))
+    assert usable(turns, track, -0.01, 0.01).tolist() == [True, True, False, False, False, False, True]
+    assert lost_to_gaps(turns, track, -0.01, 0.01) == pytest.approx(4 / 7)
+
+
+def test_a_grid_beyond_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time_grid, "_MOST_POINTS", 900)
+    with pytest.raises(BadInputError, match="cut it into parts"):
+        track_of_gyro(seen_gyro(path(0), stamps(200, 5), RNG(0)))
+
+
+# Uneven stamps and lost samples
+
+
+def turns_at(track: OrientationTrack, t: Array, took: float) -> Array:
+    """Return the track's turns from t to t + took."""
+    return so3.quat_log(so3.quat_multiply(so3.quat_conjugate(track.orientation(t)), track.orientation(t + took)))
+
+
+def followed(track: OrientationTrack, truth: Trajectory) -> tuple[float, float]:
+    """Return the share of turns of 0.2 s that the track knows, and by how many s they look late."""
+    at, took, h = np.arange(0.1, track.duration - 0.2, 0.0073), 0.2044, 1e-4
+    first = np.arange(len(at) - 28)
+    t_ns = track.origin_ns + np.round(at * 1e9).astype(np.int64)
+    known = usable(Turns(t_ns, first, first + 28, np.zeros((len(first), 3))), track, 0.0, 0.0)
+    t = at[first[known]]
+
+    def true(at: Array) -> Array:
+        R = [truth.at(x + (track.origin_ns - START_NS) * 1e-9).T_world_imu[:, :3, :3] for x in (at, at + took)]
+        out: Array = so3.log(np.swapaxes(R[0], 1, 2) @ R[1])
+        return out
+
+    slope = (true(t + h) - true(t - h)) / (2 * h)
+    return float(np.mean(known)), -float(np.sum(slope * (turns_at(track, t, took) - true(t))) / np.sum(slope**2))
+
+
+@pytest.mark.parametrize("jitter_s", [0.5e-3, 1e-3, 2e-3])
+def test_jitter_of_an_imus_stamps_loses_nothing(jitter_s: float) -> None:
+    """The rates are those of a regular clock, the stamps are not: what 4000 of them are off averages out."""
+    truth, even = path(1), stamps(200, 20)
+    samples = seen_gyro(truth, even, RNG(0), SILENT)
+    late = np.round(1e9 * jitter_s * RNG(1).standard_normal(len(even))).astype(np.int64)
+    known, delay_s = followed(track_of_gyro(gyro(even + late, samples.gyro)), truth)
+    assert known == 1
+    assert abs(delay_s) < 4 * jitter_s / np.sqrt(len(even))
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.1, 1.0), (0.3, 0.9)])
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_lost_samples_lose_few_turns_and_delay_nothing(share: float, least: float, speed: float) -> None:
+    truth = path(2, speed=speed)
+    for rate_hz in (100, 200):
+        t_ns = stamps(rate_hz, 30)[RNG(7).random(30 * rate_hz) >= share]
+        tracks = [track_of_poses(seen_poses(truth, t_ns, 0.0, RNG(0)))]
+        tracks += [track_of_gyro(seen_gyro(truth, t_ns, RNG(0), SILENT))] if rate_hz == 200 else []
+        for track in tracks:
+            known, delay_s = followed(track, truth)
+            assert known >= least
+            assert abs(delay_s) < 1e-6 * speed**2
+
+
+def test_the_noise_of_rates_is_told_where_samples_are_lost() -> None:
+    """Differences of uneven samples hold motion: 4 rad/s would pass for 18 times the noise."""
+    truth, t_ns = path(0, speed=4.0), stamps(100, 60)[RNG(3).random(6000) >= 0.3]
+    quiet, loud = (track_of_poses(seen_poses(truth, t_ns, noise, RNG(5))) for noise in (0.0, 1e-3))
+    measured = np.std((loud.rate - quiet.rate)[loud.chain >= 0], axis=0)
+    assert np.all(loud.rate_sigma > 0.8 * measured)
+    assert np.all(loud.rate_sigma < 1.6 * measured)
+
+
+def spoilt(seed: int, kind: str) -> Sample:
+    if kind == "jitter":
+        sample, rng = pose_imu(path(seed), seed, any_offset(seed), 1e-3), RNG((seed, 77))
+        assert isinstance(sample.reference, ImuSamples)
+        late = np.round(2e6 * rng.standard_normal(len(sample.reference.t_ns))).astype(np.int64)
+        return replace(sample, reference=replace(sample.reference, t_ns=sample.reference.t_ns + late))
+    sample, rng = pose_pose(path(seed), seed, any_offset(seed)), RNG((seed, 78))
+    assert isinstance(sample.reference, PoseSamples)
+    kept = rng.random(len(sample.reference.t_ns)) >= 0.3
+    return replace(sample, reference=poses(sample.reference.t_ns[kept], sample.reference.q[kept]))
+
+
+@pytest.mark.parametrize("kind", ["jitter", "drops"])
+@pytest.mark.parametrize("seeds", [2, pytest.param(30, marks=pytest.mark.slow)])
+def test_an_offset_against_a_spoilt_stream_is_honest(kind: str, seeds: int) -> None:
+    """2 ms of jitter in an IMU's stamps, or 30 % of 100 Hz poses lost: nearly all turns count, and sigma means what it says."""
+    off = []
+    for seed in range(seeds):
+        sample = spoilt(seed, kind)
+        fit = sample.fitted
+        assert fit.lost < 0.05
+        assert fit.sigma < 1.3e-4
+        off.append((fit.td - sample.td) / fit.sigma)
+    print(f"{kind}, {seeds} seeds: error over sigma {np.sqrt(np.mean(np.square(off))):.2f}")
+    low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], seeds) / seeds)
+    assert low < np.sqrt(np.mean(np.square(off))) < high
+
+
+def test_a_reference_too_uneven_is_said_to_be() -> None:
+    """Both were recorded at once: 'they share too little time' would send people to record the same again."""
+    sample = pose_pose(path(0), 0, 0.02)
+    assert isinstance(sample.reference, PoseSamples)
+    t_ns, q = sample.reference.t_ns, sample.reference.q
+    kept = np.arange(len(t_ns)) % 15 < 7  # nothing for 0.09 s, again and again
+    with pytest.raises(BadInputError, match="second come too unevenly"):
+        _ = replace(sample, reference=poses(t_ns[kept], q[kept])).fitted
+    threes = np.flatnonzero(np.arange(1500) % 50 < 3)
+    with pytest.raises(BadInputError, match="90 poses come too unevenly to follow"):
+        track_of_poses(poses(t_ns[threes], q[threes]))
 
 
 def test_too_few_samples_are_refused() -> None:

@@ -200,7 +200,7 @@ def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, fl
     stretch = part.stretch
     base = a.shift(stretch.t)
     grid = np.arange(-reach, reach + _WINDOW_STEP_S / 2, _WINDOW_STEP_S)
-    grid = grid[(stretch.t[0] + base[0] + grid >= 0) & (stretch.t[-1] + base[-1] + grid <= a.track.step * (len(a.track.q) - 1))]
+    grid = grid[(stretch.t[0] + base[0] + grid >= 0) & (stretch.t[-1] + base[-1] + grid <= a.track.duration)]
     if len(grid) < 3:
         return None
     cost = np.sum(residuals(part, a.track, a.R, base[:, None] + grid) ** 2, axis=0)

@@ -2,7 +2,8 @@
 
 Orientations on a uniform grid come from local quadratic regression on the rotation vectors of a few neighbours (Savitzky and Golay 1964,
 with tricube weights, on uneven stamps): symmetric, so that it delays nothing, and smooth, so that the noise of what is read between
-samples does not depend on where between them it is read (linear interpolation would pull every offset towards half a sample).
+samples does not depend on where between them it is read (linear interpolation would pull every offset towards half a sample). Where
+samples are sparse it reaches further, to two on either side.
 """
 
 from dataclasses import dataclass
@@ -11,38 +12,63 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.observations import ImuSamples, PoseSamples
+from calibkit.data.observations import ImuSamples, PoseSamples, Times
 from calibkit.errors import BadInputError
-from calibkit.estimation.turns import in_order
+from calibkit.estimation.time_grid import TimeGrid, grid_over
+from calibkit.estimation.turns import Index, gyro_steps, in_order
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 _REACH = 2.5  # samples to either side that the regression takes in
 _LEAST_REACH_S = 0.012
+_WIDER = 1.2  # reach over the farther one of the second neighbours, where that is more
 _STEP_S = (0.0025, 0.01)  # of the grid
 _CHUNK = 4096
 _MOST = 64  # neighbours to either side
-_MOST_POINTS = 40_000_000  # of the grid, 90 bytes each
-_HELD = 3.5  # median intervals; the rate across a longer gap in a gyroscope's stream is not known
+_HELD = 3.5  # median intervals; how a sensor turned in a longer gap is not known
+_HELD_GYRO_S, _HELD_POSES_S = 0.03, 0.07  # unless it is shorter than this
+_PAUSE_S = 1.0  # longer gaps are left out of the grid
+_ENOUGH = 20_000  # samples that tell the noise
+_LEAST = 4  # samples between two pauses; fewer tell no motion, and are often wrong stamps
 
 
 @dataclass(frozen=True)
 class OrientationTrack:
-    """R_w_s on a uniform grid, with the rate in the sensor's axes; w is any fixed frame."""
+    """R_w_s on a grid, with the rate in the sensor's axes; w is any fixed frame."""
 
     origin_ns: int
-    step: float  # s
+    grid: TimeGrid
     q: Array  # (g, 4) xyzw
     rate: Array  # (g, 3) rad/s
-    chain: NDArray[np.int64]  # (g,) orientations of different chains cannot be compared; -1 where there is none
+    chain: NDArray[np.int32]  # (g,) orientations of different chains cannot be compared; -1 where there is none
     delta: Array  # (g - 1, 3) rotation vector from each grid point to the next
     rate_sigma: Array  # (3,) rad/s, noise of the rates after smoothing
     reach: float  # s; noise of rates is alike within it
+
+    @property
+    def step(self) -> float:
+        return self.grid.step
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first sample to the last, pauses included."""
+        return self.grid.duration
 
     @cached_property
     def bend(self) -> Array:
         """Return (g - 1, 3) rad: by how much the way between two grid points would overshoot at the rate of its start, over four."""
         return np.asarray((0.5 * self.step) * (self.rate[:-1] - self.rate[1:]), np.float64)
+
+    @cached_property
+    def unknown(self) -> NDArray[np.int32]:
+        """Return how many of the ways between grid points before each point (g,) are not known."""
+        bad = (self.chain[:-1] < 0) | (self.chain[:-1] != self.chain[1:])
+        return np.concatenate([[0], np.cumsum(bad)]).astype(np.int32)
+
+    def followed(self, duration: float) -> float:
+        """Return the share of the time from which on the track is known for so many s."""
+        many = min(int(np.ceil(duration / self.step)), len(self.q) - 1)
+        return float(np.mean(self.unknown[many:] == self.unknown[: len(self.q) - many]))
 
     def orientation(self, t: Array) -> Array:
         """Return orientations (..., 4) at seconds from the origin; outside, those of the ends.
@@ -60,62 +86,61 @@ class OrientationTrack:
 
     def chain_at(self, t: Array) -> NDArray[np.int64]:
         """Return the chain (...) that seconds from the origin belong to; -1 where nothing is known."""
+        place = self.grid.place(t)
         cell, _ = self._place(t)
-        inside = (t >= 0) & (t <= self.step * (len(self.q) - 1))
+        inside = (place >= 0) & (place <= len(self.q) - 1)
         return np.where(inside & (self.chain[cell] == self.chain[cell + 1]), self.chain[cell], -1)
 
     def _place(self, t: Array) -> tuple[NDArray[np.int64], Array]:
-        place = np.clip(np.asarray(t, float) / self.step, 0, len(self.q) - 1)
+        place = np.clip(self.grid.place(np.asarray(t, float)), 0, len(self.q) - 1)
         cell = np.minimum(place.astype(np.int64), len(self.q) - 2)
         return cell, (place - cell)[..., None]
 
 
 def track_of_gyro(samples: ImuSamples, bias: Array | None = None) -> OrientationTrack:
-    """Return the orientation that a gyroscope (rad/s) adds up to, from its own start; gaps part it into chains.
-
-    Each interval turns by h (w0 + w1) / 2 + h^2 (w0 x w1) / 12 (Magnus to fourth order, Iserles et al. 2000, on a linear rate).
-    """
-    order = in_order(samples.t_ns)
+    """Return the orientation that a gyroscope (rad/s) adds up to, from its own start; gaps part it into chains."""
+    order = _between_pauses(samples.t_ns, _HELD_GYRO_S, "gyroscope samples")
     t_ns, rate = samples.t_ns[order], samples.gyro[order] - (0.0 if bias is None else bias)
-    if len(t_ns) < 10:
-        raise BadInputError(f"{len(t_ns)} gyroscope samples are too few to follow a motion: record 10 s or more")
-    sigma = _noise(rate, 5)
-    t_ns, rate = _filled(t_ns, rate)
-    h = np.diff(t_ns)[:, None] * 1e-9
-    steps = h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12
-    parted = np.concatenate([[0], np.cumsum(h[:, 0] > max(_HELD * float(np.median(h)), 2 * _LEAST_REACH_S))])
-    return _smooth(t_ns, accumulate(so3.quat_exp(steps)), parted, sigma, walked=True)
-
-
-def _filled(t_ns: NDArray[np.int64], rate: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return the samples with those that are missing put in on a straight line, where no more than two or three in a row are."""
-    h = np.diff(t_ns)
-    typical = float(np.median(h))
-    short = (h > 1.5 * typical) & (h <= max(_HELD * typical, 2e9 * _LEAST_REACH_S))
-    missing = np.where(short, np.maximum(np.rint(h / typical).astype(np.int64) - 1, 1), 0)
-    after = np.repeat(np.arange(len(h)), missing)
-    nth = np.arange(len(after)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
-    f = nth / (missing[after] + 1)
-    t_new = t_ns[after] + np.rint(f * h[after]).astype(np.int64)
-    rate_new = rate[after] + f[:, None] * (rate[after + 1] - rate[after])
-    t_all, rate_all = np.concatenate([t_ns, t_new]), np.concatenate([rate, rate_new])
-    order = np.argsort(t_all, kind="stable")
-    return t_all[order], rate_all[order]
+    return _smooth(t_ns, accumulate(so3.quat_exp(gyro_steps(t_ns, rate))), _noise(t_ns, rate), _HELD_GYRO_S, walked=True)
 
 
 def track_of_poses(poses: PoseSamples) -> OrientationTrack:
     """Return the smoothed orientation of the poses' child in their parent; where they pause it is not known."""
-    order = in_order(poses.t_ns)
-    if len(order) < 10:
-        raise BadInputError(f"{len(order)} poses are too few to follow a motion: record 10 s or more")
+    order = _between_pauses(poses.t_ns, _HELD_POSES_S, "poses")
     t_ns, q = poses.t_ns[order], poses.q[order]
-    steps = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[:-1]), q[1:]))
-    return _smooth(t_ns, q, np.zeros(len(order), np.int64), _noise(steps, 4), walked=False)
+    turned = np.cumsum(so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[:-1]), q[1:])), axis=0)
+    return _smooth(t_ns, q, _noise(t_ns[1:], turned), _HELD_POSES_S, walked=False)
 
 
-def _noise(values: Array, order: int) -> Array:
-    """Return sigma (3,) of white noise in values that are differenced to the fifth order in all: motion is smooth, and drops out."""
-    return np.asarray(1.4826 * np.median(np.abs(np.diff(values, order, axis=0)), axis=0) / np.sqrt(252), np.float64)
+def _between_pauses(t_ns: Times, held_s: float, noun: str) -> Index:
+    """Return the rows in the order of time, without those that lie alone between long pauses."""
+    order = in_order(t_ns)
+    t = t_ns[order]
+    step = np.diff(t)
+    pause = 1e9 * _pause(1e-9 * float(np.median(step)) if len(step) else 0.0, held_s)
+    piece = np.concatenate([[0], np.cumsum(step > pause)])[: len(t)]
+    order = order[np.bincount(piece)[piece] >= _LEAST] if len(t) else order
+    if len(order) < 10:
+        raise BadInputError(f"{len(order)} {noun} are too few to follow a motion: record 10 s or more")
+    return order
+
+
+def _held(interval: float, held_s: float) -> float:
+    return max(_HELD * interval, held_s)
+
+
+def _pause(interval: float, held_s: float) -> float:
+    return max(_held(interval, held_s), _PAUSE_S)
+
+
+def _noise(t_ns: Times, values: Array) -> Array:
+    """Return sigma (3,) of white noise in values (n, 3), from divided differences of fifth order: motion is smooth, and drops out."""
+    start = np.arange(0, len(t_ns) - 5, -(-len(t_ns) // _ENOUGH))[:, None] + np.arange(6)
+    t = (t_ns[start] - t_ns[start[:, :1]]) * 1e-9
+    apart = t[:, :, None] - t[:, None] + np.eye(6)
+    weight = 1 / np.prod(apart / apart[:, -1:, :1], axis=2)
+    weight /= np.linalg.norm(weight, axis=1, keepdims=True)
+    return np.asarray(1.4826 * np.median(np.abs(np.einsum("wk,wki->wi", weight, values[start])), axis=0), np.float64)
 
 
 def accumulate(q: Array) -> Array:
@@ -123,55 +148,71 @@ def accumulate(q: Array) -> Array:
     width = max(1, int(np.sqrt(len(q))))
     rows = -(-len(q) // width)
     identity = np.array([0.0, 0.0, 0.0, 1.0])
-    padded = np.tile(identity, (rows * width, 1))
-    padded[: len(q)] = q
-    table = padded.reshape(rows, width, 4)
+    out = np.tile(identity, (rows * width + 1, 1))
+    out[1 : len(q) + 1] = q
+    table = out[1:].reshape(rows, width, 4)
     for k in range(1, width):
         table[:, k] = so3.quat_multiply(table[:, k - 1], table[:, k])
     start = identity
     for row in table:
         row[:] = so3.quat_multiply(start, row)
         start = row[-1] / np.linalg.norm(row[-1])
-    return np.concatenate([identity[None], padded[: len(q)]])
+    return out[: len(q) + 1]
 
 
-def _smooth(t_ns: NDArray[np.int64], q: Array, parted: NDArray[np.int64], sigma: Array, walked: bool) -> OrientationTrack:
+def _smooth(t_ns: Times, q: Array, sigma: Array, held_s: float, walked: bool) -> OrientationTrack:
     """Return the track through orientations with noise sigma (3,) rad; `walked`: through sums of rates with noise sigma rad/s."""
     t: Array = np.asarray((t_ns - t_ns[0]) * 1e-9, np.float64)
     interval = float(np.median(np.diff(t)))
-    reach = max(_REACH * interval, _LEAST_REACH_S)
-    step = float(np.clip(interval, *_STEP_S))
-    if t[-1] > _MOST_POINTS * step:
-        raise BadInputError(f"its {len(t)} stamps span {t[-1] / 3600:.0f} h: cut it, or correct stamps that are far from the others")
-    grid: Array = np.arange(int(t[-1] / step) + 1, dtype=float) * step
-    parts = [_regress(grid[i : i + _CHUNK], t, q, parted, reach, interval, walked) for i in range(0, len(grid), _CHUNK)]
-    fitted, rate, chain, power = (np.concatenate(each) for each in zip(*parts, strict=True))
-    delta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[:-1]), fitted[1:]))
-    gain = float(np.sqrt(np.median(power)))
-    return OrientationTrack(int(t_ns[0]), step, fitted, rate, chain, delta, gain * sigma, reach)
+    parted = np.concatenate([[0], np.cumsum(np.diff(t) > _held(interval, held_s))])
+    grid = grid_over(t, float(np.clip(interval, *_STEP_S)), _pause(interval, held_s))
+    at, size = grid.t, int(grid.first[-1])
+    fitted, rate, power = np.empty((size, 4)), np.empty((size, 3)), np.empty(size)
+    chain, delta = np.empty(size, np.int32), np.empty((size - 1, 3))
+    for i in range(0, size, _CHUNK):
+        rows = slice(i, i + _CHUNK)
+        fitted[rows], rate[rows], chain[rows], power[rows] = _regress(at[rows], t, q, parted, interval, walked)
+        rows = slice(max(i - 1, 0), min(i + _CHUNK, size) - 1)
+        delta[rows] = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(fitted[rows]), fitted[rows.start + 1 : rows.stop + 1]))
+    if not np.any((chain[1:] >= 0) & (chain[1:] == chain[:-1])):
+        noun = "gyroscope samples" if walked else "poses"
+        raise BadInputError(f"{len(t)} {noun} come too unevenly to follow a motion: record without losses, with the sensor's own stamps")
+    gain = float(np.sqrt(np.median(power[chain >= 0])))
+    if not walked:
+        np.minimum(chain, 0, out=chain)
+    return OrientationTrack(int(t_ns[0]), grid, fitted, rate, chain, delta, gain * sigma, _reach(interval))
+
+
+def _reach(interval: float) -> float:
+    return max(_REACH * interval, _LEAST_REACH_S)
 
 
 def _regress(
-    grid: Array, t: Array, q: Array, parted: NDArray[np.int64], reach: float, interval: float, walked: bool
+    grid: Array, t: Array, q: Array, parted: NDArray[np.int64], interval: float, walked: bool
 ) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """Return orientation, rate and chain at the grid's instants, and the rate's variance for noise of unit variance.
 
     v(s) = v0 + v1 s + v2 s^2 by least squares, v = log(q_nearest^-1 q).
     """
-    most = min(int(np.ceil(reach / interval)) + 1, _MOST)
-    centre = np.clip(np.searchsorted(t, grid), 0, len(t) - 1)
+    n, least = len(t), _reach(interval)
+    most = min(int(np.ceil(least / interval)) + 1, _MOST)
+    after, beyond = np.searchsorted(t, grid), np.searchsorted(t, grid, side="right")
+    second, second_last = after + 1, beyond - 2
+    centre = np.clip(after, 0, n - 1)
     near = centre[:, None] + np.arange(-most, most + 1)
-    real = (near >= 0) & (near < len(t))
-    near = np.clip(near, 0, len(t) - 1)
-    s = t[near] - grid[:, None]
-    inside = real & (np.abs(s) < reach)
-    w = np.where(inside, (1 - np.minimum(np.abs(s) / reach, 1) ** 3) ** 3, 0.0)
-    s = s / reach
+    real = (near >= 0) & (near < n)
+    real[:, -1] &= beyond > after  # as many before as after: one more would delay
+    near = np.clip(near, 0, n - 1)
+    known = (second_last >= 0) & (second < n)
+    second, second_last = np.minimum(second, n - 1), np.maximum(second_last, 0)
+    known &= parted[second_last] == parted[second]
+    far = np.where(known, np.maximum(grid - t[second_last], t[second] - grid), 0.0)
+    reach = np.maximum(least, _WIDER * far)[:, None]
+    s = (t[near] - grid[:, None]) / reach
+    inside = real & (np.abs(s) < 1) & (parted[near] == parted[second][:, None])
+    w = np.where(inside, (1 - np.minimum(np.abs(s), 1) ** 3) ** 3, 0.0)
     moments = np.stack([np.sum(w * s**k, axis=1) for k in range(5)], axis=1)
     normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
-    around = (np.sum(inside & (s <= 0), axis=1) >= 2) & (np.sum(inside & (s >= 0), axis=1) >= 2) & (inside.sum(axis=1) >= 4)
-    first, last = np.where(inside, near, len(t)).min(axis=1), np.where(inside, near, -1).max(axis=1)
-    known = around & (parted[np.minimum(first, len(t) - 1)] == parted[last])
     normal[~known] = np.eye(3)
     rows = np.linalg.inv(normal)[:, :2] @ (np.stack([w, w * s, w * s**2], axis=1))  # (g, 2, k): what v0 and v1 take of each neighbour
     v = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[centre])[:, None], q[near]))
@@ -181,4 +222,4 @@ def _regress(
     if walked:  # what an orientation takes of each rate: of all before it
         weights = interval * np.cumsum(weights[:, ::-1], axis=1)[:, :-1]
     power: Array = np.sum(weights**2, axis=1)
-    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[centre], -1), power
+    return so3.quat_multiply(q[centre], so3.quat_exp(v0)), rate, np.where(known, parted[second], -1), power

@@ -103,19 +103,6 @@ def without_repeats(stream: PoseStream) -> PoseStream:
     return stream.select(~held(stream))
 
 
-def filled(stream: PoseStream) -> PoseStream:
-    """Return the stream (in time, without repeats) with the samples that short gaps miss read from the curve across them."""
-    step = np.diff(stream.t_ns)
-    interval = stream.interval * 1e9
-    more = np.where(step <= LONGEST_GAP * interval, np.rint(step / interval).astype(np.intp) - 1, 0).clip(0)
-    gap = np.repeat(np.arange(len(step)), more)
-    number = 1 + np.arange(len(gap)) - np.repeat(np.cumsum(more) - more, more)
-    t_ns = stream.t_ns[gap] + step[gap] * number // (more[gap] + 1)
-    read = interpolate(stream, t_ns)
-    order = np.argsort(both := np.concatenate([stream.t_ns, t_ns]), kind="stable")
-    return PoseStream(stream.name, both[order], np.concatenate([stream.T, read.T])[order])
-
-
 def interpolate(stream: PoseStream, t_ns: Times) -> Interpolated:
     """Return the stream (in time, without repeats) at t_ns (n,).
 

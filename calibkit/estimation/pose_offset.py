@@ -8,7 +8,7 @@ from calibkit.data.observations import PoseSamples, Times
 from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Status
 from calibkit.errors import BadInputError
-from calibkit.estimation.pose_interpolation import PoseStream, filled, in_time, without_repeats
+from calibkit.estimation.pose_interpolation import PoseStream, in_time, without_repeats
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
@@ -135,6 +135,6 @@ def offset_by_turns(
 def _fit(slow: PoseStream, fast: PoseStream, progress: Progress) -> TimeOffsetFit:
     moves = without_repeats(slow)
     turns = turns_of_orientations(moves.t_ns, so3.to_quat(moves.T[:, :3, :3]), None if moves.cov is None else moves.cov[:, 3:, 3:])
-    fast = filled(without_repeats(fast))  # a track needs neighbours on both sides
+    fast = without_repeats(fast)
     reference = PoseSamples(fast.t_ns, so3.to_quat(fast.T[:, :3, :3]), fast.T[:, :3, 3], "world", fast.name)
     return fit_time_offset(turns, reference, TurnSettings(), progress)

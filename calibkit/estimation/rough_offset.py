@@ -11,6 +11,7 @@ from calibkit.estimation.turns import Turns
 from calibkit.geometry.so3 import Array
 
 _STEP_S = (0.02, 0.1)  # of the resampled rates
+_MOST_BINS = 1_000_000  # over pauses of hours the rates are compared more coarsely
 _MEMORY_S = 0.5  # rates are alike for so long: a second of overlap counts as two independent looks
 _LEAST_OVERLAP_S = 5.0
 _LEAST_SHARE = 0.1  # of the shorter recording
@@ -38,7 +39,8 @@ def rough_offsets(turns: Turns, track: OrientationTrack) -> list[Candidate]:
     the mean is that of the overlap, so that neither gaps nor a part that the other lacks pull the lag.
     """
     typical = float(np.median(turns.duration))
-    h = float(np.clip(typical, *_STEP_S))
+    span = max(track.duration, float(turns.t_ns[-1] - turns.t_ns[0]) * 1e-9)
+    h = max(float(np.clip(typical, *_STEP_S)), span / _MOST_BINS)
     fast, has_fast = _rate_of_track(track, h)
     slow, has_slow = _rate_of_turns(turns, h)
     if not (has_fast.any() and has_slow.any()):
@@ -85,7 +87,7 @@ def _clipped(rate: Array, has: Mask) -> Array:
 
 def _rate_of_track(track: OrientationTrack, h: float) -> tuple[Array, Mask]:
     """Return the mean |omega| in bins of h s from the track's origin."""
-    bins = (np.arange(len(track.rate)) * track.step / h).astype(np.int64)
+    bins = (track.grid.t / h).astype(np.int64)
     good = track.chain >= 0
     count = np.bincount(bins[good], minlength=bins[-1] + 1)
     total = np.bincount(bins[good], np.linalg.norm(track.rate[good], axis=1), minlength=bins[-1] + 1)

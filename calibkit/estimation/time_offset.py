@@ -29,7 +29,7 @@ from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyr
 from calibkit.estimation.slow_turns import by_slow_turns, joined_up, turns_in_long_one
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset_start import Start, find_starts
-from calibkit.estimation.turn_comparison import raw_residuals, split, usable
+from calibkit.estimation.turn_comparison import lost_to_gaps, raw_residuals, split, usable, why_so_few
 from calibkit.estimation.turn_noise import NoiseLevels
 from calibkit.estimation.turns import Turns
 from calibkit.geometry.so3 import Array
@@ -84,6 +84,7 @@ class TimeOffsetFit:
     n_turns: int  # in the overlap
     gain: float  # chi-squared that the reference's turns explain, correlation paid for
     noise_share: float  # of the information on tau, that noise pretends
+    lost: float = 0.0  # share of the turns within the reference's span that its gaps take
     by_fast_turns: tuple[float, float] | None = None  # td and sigma by turns from stamp to stamp, where they contradict these
 
     @property
@@ -135,7 +136,7 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
     _refuse_other_unit(turns, track)
     starts = find_starts(turns, track, settings.rotation)
     if not starts:
-        raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
+        raise BadInputError(why_so_few(turns, track, settings.reach_s))
     start, reach = starts[0], settings.reach_s
     a = settle(_begin(turns, track, start, settings, reach), settings.levels, progress)
     bias, taken_out = _bias(a), np.zeros(3)
@@ -175,6 +176,7 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
         gain=turned_alike(a, parts) / _inflation(covariance),
         noise_share=noise_share,
+        lost=lost_to_gaps(replace(turns, t_ns=turns.t_ns + start.coarse_ns), a.track, -reach - _MARGIN_S, reach + _MARGIN_S),
     )
     return replace(fit, second=_second(fit, starts[1:]))
 
@@ -203,7 +205,7 @@ def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settin
     whole = replace(turns, t_ns=turns.t_ns + start.coarse_ns)
     keep = usable(whole, track, -reach - _MARGIN_S, reach + _MARGIN_S)
     if keep.sum() < _FEWEST:
-        raise BadInputError("they share too little time to be compared: record both at once, 10 s or more")
+        raise BadInputError(why_so_few(turns, track, reach))
     stretches = split(whole.select(keep), track.origin_ns, settings.free_bias)
     return Alignment(
         track=track,

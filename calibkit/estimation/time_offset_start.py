@@ -34,6 +34,9 @@ def find_starts(turns: Turns, track: OrientationTrack, rotation: Array | None) -
     At each trial lag R = argmin sum w |alpha - R beta|^2 in closed form (Wahba 1965 by SVD, Arun 1987); w goes by how well |alpha| and
     |beta| agree, which needs no R, so that wrong turns count little.
     """
+    if not len(turns.first):
+        return []
+    turns = turns.select(slice(None))  # a stamp before the first turn may be wrong by hours
     between = (int(turns.t_ns[0]) - track.origin_ns) * 1e-9
     tried = [*rough_offsets(turns, track), Candidate(between, 0.0, 0.0, _REACH_S)]
     found = [_try(turns, track, rotation, candidate, between) for candidate in tried]

@@ -20,8 +20,10 @@ from calibkit.geometry.so3 import Array
 
 STRETCH_S = 5.0
 LEAST_TURNS = 8  # in a stretch
+_UNEVEN = 0.5  # of the time the track must be known for as long as a turn takes
 TILT = 0.5  # rad; what a rotation that nothing tells may be off by: keeps its elimination finite
 
+Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 
@@ -153,11 +155,29 @@ def moved(R: Array, d: Array) -> Array:
 
 def usable(turns: Turns, track: OrientationTrack, low: float, high: float) -> Mask:
     """Return the turns (n,) over which the track is known throughout, for every shift of low to high s of their stamps."""
-    bad = (track.chain[:-1] < 0) | (track.chain[:-1] != track.chain[1:])
-    before = np.concatenate([[0], np.cumsum(bad)])
-    t = _seconds(turns.t_ns, track.origin_ns)
-    start = np.floor((t[turns.first] + low) / track.step).astype(np.int64)
-    stop = np.ceil((t[turns.last] + high) / track.step).astype(np.int64)
-    inside = (start >= 0) & (stop <= len(bad))
-    start, stop = np.clip(start, 0, len(bad)), np.clip(stop, 0, len(bad))
-    return np.asarray(inside & (before[stop] == before[start]), np.bool_)
+    start, stop, inside = _spanned(turns, track, low, high)
+    return np.asarray(inside & (track.unknown[stop] == track.unknown[start]), np.bool_)
+
+
+def lost_to_gaps(turns: Turns, track: OrientationTrack, low: float, high: float) -> float:
+    """Return the share of the turns within the track's span that are not usable: gaps of its samples take them."""
+    start, stop, inside = _spanned(turns, track, low, high)
+    return float(np.mean((track.unknown[stop] != track.unknown[start])[inside])) if inside.any() else 0.0
+
+
+def why_so_few(turns: Turns, track: OrientationTrack, reach: float) -> str:
+    """Say why hardly a turn can be compared, at whatever offset."""
+    if len(turns.first) and track.followed(float(np.median(turns.duration)) + 2 * reach) < _UNEVEN:
+        return (
+            "the samples of the second come too unevenly to follow it through the turns of the first: "
+            "record it without losses, with the sensor's own stamps"
+        )
+    return "they share too little time to be compared: record both at once, 10 s or more"
+
+
+def _spanned(turns: Turns, track: OrientationTrack, low: float, high: float) -> tuple[Index, Index, Mask]:
+    """Return the track's grid points about each turn (n,) for every shift of low to high s, and whether it has them."""
+    t, last = _seconds(turns.t_ns, track.origin_ns), len(track.unknown) - 1
+    start = np.floor(track.grid.place(t[turns.first] + low)).astype(np.intp)
+    stop = np.ceil(track.grid.place(t[turns.last] + high)).astype(np.intp)
+    return np.clip(start, 0, last), np.clip(stop, 0, last), (start >= 0) & (stop <= last)

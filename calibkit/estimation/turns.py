@@ -82,10 +82,10 @@ def turns_of_gyro(samples: ImuSamples, interval: float = 0.02) -> Turns:
     """Return how a gyroscope turned over intervals of about `interval` s, bias included; none across gaps."""
     order = in_order(samples.t_ns)
     t_ns, rate = samples.t_ns[order], samples.gyro[order]
-    h = np.diff(t_ns)[:, None] * 1e-9
+    h = np.diff(t_ns) * 1e-9
     typical = float(np.median(h)) if len(h) else interval
     many = max(1, round(interval / typical))
-    steps = h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12
+    steps = gyro_steps(t_ns, rate)
     whole = len(steps) // many * many
     q = so3.quat_exp(steps[:whole]).reshape(-1, many, 4)
     turned = q[:, 0]
@@ -93,10 +93,19 @@ def turns_of_gyro(samples: ImuSamples, interval: float = 0.02) -> Turns:
         turned = so3.quat_multiply(turned, q[:, k])
     angle = so3.quat_log(turned)
     stamps = t_ns[: whole + 1 : many]
-    steady = (h[:whole, 0].reshape(-1, many) < _GAP * typical).all(axis=1)
+    steady = (h[:whole].reshape(-1, many) < _GAP * typical).all(axis=1)
     first = np.flatnonzero(steady)
     moving = np.any(samples.gyro != 0, axis=0) if len(samples.gyro) else np.ones(3, bool)
     return Turns(stamps, first, first + 1, angle[first], axes=(bool(moving[0]), bool(moving[1]), bool(moving[2])))
+
+
+def gyro_steps(t_ns: Times, rate: Array) -> Array:
+    """Return the rotation vectors (n - 1, 3) between the stamps of rates (n, 3) in rad/s, linear in between.
+
+    h (w0 + w1) / 2 + h^2 (w0 x w1) / 12, Magnus to fourth order (Iserles et al. 2000, Lie-group methods).
+    """
+    h = np.diff(t_ns)[:, None] * 1e-9
+    return np.asarray(h * (rate[:-1] + rate[1:]) / 2 + h**2 * np.cross(rate[:-1], rate[1:]) / 12, np.float64)
 
 
 def turns_of_orientations(t_ns: Times, q: Array, end_cov: Array | None = None) -> Turns:

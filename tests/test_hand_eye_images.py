@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import Run
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from calibkit.data.observations import BoardViews
 from calibkit.data.rig import Camera, Estimate, Rig
@@ -37,8 +38,8 @@ ROBOT = RobotNoise(np.deg2rad(0.05), 3e-4)
 FAST, SLOW = 5, 100
 
 
-def seeds(fast: int = FAST) -> list:
-    return [pytest.param(fast, id=f"{fast} seeds"), pytest.param(SLOW, id="all seeds", marks=pytest.mark.slow)]
+def seeds(fast: int = FAST, slow: int = SLOW) -> list:
+    return [pytest.param(fast, id=f"{fast} seeds"), pytest.param(slow, id="all seeds", marks=pytest.mark.slow)]
 
 
 def lens(params: Array = SIM.params, cov: Array | None = None) -> Camera:
@@ -82,13 +83,13 @@ def error(fit: HandEyeFit, X: Array) -> Array:
 
 
 def assert_honest(errors: list[Array], covs: list[Array], slow: bool) -> None:
-    """STYLE test 6: 99.9 % chi-squared bands of 100 seeds; a few seeds tell of a gross lie only."""
+    """STYLE test 6: 99.9 % chi-squared bands; a few seeds tell of a gross lie only."""
     z = np.array([e / np.sqrt(np.diag(cov)) for e, cov in zip(errors, covs, strict=True)])
     rms = np.sqrt(np.mean(z**2, axis=0))
     size = len(errors[0])
     pooled = float(np.sqrt(np.mean([e @ np.linalg.solve(cov, e) / size for e, cov in zip(errors, covs, strict=True)])))
     print("rms of error / sigma", rms.round(2), "pooled", round(pooled, 3))
-    each, together = ((0.77, 1.24), (0.8, 1.25)) if slow else ((0.1, 2.1), (0.6, 1.5))
+    each, together = (np.sqrt(chi2.ppf([0.0005, 0.9995], len(z)) / len(z)), (0.8, 1.25)) if slow else ((0.1, 2.1), (0.6, 1.5))
     assert np.all((rms > each[0]) & (rms < each[1]))
     assert together[0] < pooled < together[1]
 
@@ -159,7 +160,7 @@ def test_sigmas_are_honest(setup: str, n_seeds: int) -> None:
         assert fit.lens is None
         errors.append(error(fit, X))
         covs.append(fit.cov_X)
-    assert_honest(errors, covs, n_seeds == SLOW)
+    assert_honest(errors, covs, n_seeds >= SLOW)
 
 
 @pytest.mark.parametrize("setup", SETUPS)
@@ -188,7 +189,7 @@ def test_what_the_robots_noise_is_told_to_be_is_taken(n_seeds: int) -> None:
         assert fit.noise["P_translation"] == pytest.approx(robot.translation)
         errors.append(error(fit, X))
         covs.append(fit.cov_X)
-    assert_honest(errors, covs, n_seeds == SLOW)
+    assert_honest(errors, covs, n_seeds >= SLOW)
 
 
 @pytest.mark.parametrize("n_seeds", seeds())
@@ -200,7 +201,7 @@ def test_exact_poses_of_an_exact_robot(n_seeds: int) -> None:
         assert fit.kept.all()
         errors.append(error(fit, X))
         covs.append(fit.cov_X)
-    assert_honest(errors, covs, n_seeds == SLOW)
+    assert_honest(errors, covs, n_seeds >= SLOW)
 
 
 def test_exact_poses_of_a_robot_that_is_not_cost_accuracy() -> None:
@@ -229,7 +230,7 @@ def test_thirty_per_cent_wrong_robot_poses_are_left_out(setup: str, n_seeds: int
         assert fit.converged
         errors.append(error(fit, X))
         covs.append(fit.cov_X)
-    assert_honest(errors, covs, n_seeds == SLOW)
+    assert_honest(errors, covs, n_seeds >= SLOW)
 
 
 def test_wrong_corners_are_given_up() -> None:
@@ -278,7 +279,7 @@ def test_an_arm_out_of_shape_is_found_out_and_its_places_count_less(n_seeds: int
 # ---- the lens
 
 
-@pytest.mark.parametrize("n_seeds", seeds())
+@pytest.mark.parametrize("n_seeds", seeds(slow=200))
 @pytest.mark.parametrize("setup", SETUPS)
 def test_a_free_lens_finds_its_focal_length_and_both_sigmas_are_honest(setup: str, n_seeds: int) -> None:
     wrong = SIM.params * np.array([1.005, 1.005, 1, 1, 1, 1, 1, 1])
@@ -294,8 +295,8 @@ def test_a_free_lens_finds_its_focal_length_and_both_sigmas_are_honest(setup: st
         lens_errors.append(fit.refined.corners.lens - SIM.params)
         lens_covs.append(fit.lens.cov)
         held.append(error(solve(setup, G, views, lens(wrong))[0], X))
-    assert_honest(errors, covs, n_seeds == SLOW)
-    assert_honest(lens_errors, lens_covs, n_seeds == SLOW)
+    assert_honest(errors, covs, n_seeds >= SLOW)
+    assert_honest(lens_errors, lens_covs, n_seeds >= SLOW)
     assert np.sqrt(np.mean(np.square(lens_errors)[:, :2])) < 0.5  # px, of 2.3
     assert np.sum(np.square(errors)) < np.sum(np.square(held))
 

@@ -19,9 +19,12 @@ def run(
     ],
     of: Annotated[
         str | None,
-        typer.Option("--of", metavar="SENSOR", help="Sensor (name or topic) whose stamps are to be corrected. [default: the camera]"),
+        typer.Option("--of", metavar="SENSOR", help="Name or topic of the sensor whose stamps td is added to. [default: the other one]"),
     ] = None,
-    to: Annotated[str | None, typer.Option("--to", metavar="SENSOR", help="Sensor whose clock counts. [default: the IMU]")] = None,
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="SENSOR", help="Name or topic of the sensor whose clock counts. [default: the IMU, else the faster]"),
+    ] = None,
     camera: Annotated[list[str] | None, typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable.")] = None,
     imu: Annotated[list[str] | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic; repeatable.")] = None,
     pose: Annotated[
@@ -36,7 +39,7 @@ def run(
     report: options.Report = None,
     json_file: options.Json = None,
     plain: Annotated[
-        bool, typer.Option("--plain", help="Without a board: rotation alone explains the features (f * gyro). Biased beside near things.")
+        bool, typer.Option("--plain", help="Without a board: rotation alone moves features (f * gyro). Wrong by ms where things are near.")
     ] = False,
     inverse_poses: Annotated[
         bool, typer.Option("--inverse-poses", help="Poses are those of the world seen from the sensor (T_sensor_world).")
@@ -44,17 +47,27 @@ def run(
     fix_rotation: Annotated[
         bool, typer.Option("--fix-rotation", help="Take the rotation between the sensors from the rig file. [default: found anew]")
     ] = False,
-    reach: Annotated[float, typer.Option("--reach", metavar="MS", help="Of the V to either side; it widens itself where it must.")] = 50.0,
-    step: Annotated[float, typer.Option("--step", metavar="MS", help="Of the V.")] = 0.5,
-    bootstrap: Annotated[int, typer.Option("--bootstrap", metavar="N", help="Also draw the stretches of the recording N times.")] = 0,
+    reach: Annotated[
+        float, typer.Option("--reach", metavar="MS", help="Offsets tried to either side of the rough one; more where that is too little.")
+    ] = 50.0,
+    step: Annotated[
+        float, typer.Option("--step", metavar="MS", help="Between the offsets that are tried; td itself is finer than that.")
+    ] = 0.5,
+    bootstrap: Annotated[
+        int, typer.Option("--bootstrap", metavar="N", help="Check sigma: draw the recording's stretches of 5 s anew N times, say 1000.")
+    ] = 0,
     gyro_bandwidth: Annotated[
-        float | None, typer.Option("--gyro-bandwidth", metavar="HZ", help="Of the gyroscope's low-pass: tells what of td is its delay.")
+        float | None,
+        typer.Option(
+            "--gyro-bandwidth", metavar="HZ", help="-3 dB of the gyroscope's low-pass: says what of td is its delay, and leaves td."
+        ),
     ] = None,
     exposure: Annotated[
-        float | None, typer.Option("--exposure", metavar="MS", help="Of the camera, if its stamps are the exposure's start.")
+        float | None, typer.Option("--exposure", metavar="MS", help="Of a camera whose stamps are the exposure's start: likewise.")
     ] = None,
     readout: Annotated[
-        float | None, typer.Option("--readout", metavar="MS", help="From the first row to the last, if stamps are the first row's.")
+        float | None,
+        typer.Option("--readout", metavar="MS", help="First row to last, of a camera whose stamps are the first row's: likewise."),
     ] = None,
     rate: options.Rate = None,
     gyro_unit: options.GyroUnit = None,
@@ -64,10 +77,12 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Time offset of two sensors that turn together: t_to = t_of + td, with its interval, over time, at any lag.
+    """Find how far the clocks of two sensors on one rigid body are apart: t_to = t_of + td. Add td to the stamps of the first, --of.
 
-    Camera and IMU (with --target by a board, else by the scene), odometry and IMU, two pose streams, two IMUs, wheel odometry and IMU.
-    The motion must turn, and change its rate of turn. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the recording does not tell td.
+    Pairs: camera and IMU (by a board with --target, else by features of the scene; the lens comes from --rig), poses or odometry and IMU,
+    two pose streams, two IMUs, wheel odometry and IMU. Two that are alone are found by themselves. Turn the rig back and forth about two
+    or more axes, once or twice a second: at rest, or at a constant rate of turn, nothing tells td. Drifts and jumps of a clock are told.
+    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the recording does not tell td.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
@@ -82,8 +97,8 @@ def run(
     for name, given in (("--gyro-bandwidth", gyro_bandwidth), ("--exposure", exposure), ("--readout", readout)):
         if given is not None and not 0 < given < 1e5:
             raise BadInputError(f"{name} {given:g}: give a number above 0")
-    if not 0 <= bootstrap <= 100000:
-        raise BadInputError(f"--bootstrap {bootstrap}: give 0 to 100000")
+    if not 0 <= bootstrap <= 10_000:
+        raise BadInputError(f"--bootstrap {bootstrap}: give 0 to 10000")
     asked = Options(
         of=of,
         to=to,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibkit.data.observations import ImuSamples, PoseSamples
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
 from calibkit.data.transforms import find_transform
@@ -25,6 +26,7 @@ from calibkit.stages.sensors import Sensor, choose_pair, find_sensors
 
 _DEFAULT = ImuOptions()
 _NO_DELAYS = Delays()
+_FEWEST_DRAWN = 9  # stretches; the spread over draws of fewer says more of chance than of td
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,17 @@ def time_offset(
         fit = fit_time_offset(turns, seen_to.samples, settings, progress)
     except BadInputError as error:
         raise BadInputError(f"{recording.name}: {of.name} and {to.name}: {error}") from None
-    spread = bootstrap_sigma(fit, options.bootstrap) if options.bootstrap else None
+    few = len(fit.alignment.parts) < _FEWEST_DRAWN
+    spread = bootstrap_sigma(fit, options.bootstrap) if options.bootstrap and not few else None
     stamps = {sensor.name: check_stamps(seen.t_ns) for sensor, seen in ((of, seen_of), (to, seen_to))}
     result = time_offset_result(pair, fit, base, stamps, options.delays, spread)
-    result = replace(result, facts={**result.facts, "warnings": [*recording.warnings, *reader.warnings]})
+    warnings = [*recording.warnings, *reader.warnings]
+    if options.bootstrap and few:
+        there = counted(len(fit.alignment.parts), "stretch", "stretches")
+        warnings.append(
+            f"--bootstrap: {there} of 5 s are too few to draw from, {_FEWEST_DRAWN} are needed: record {5 * _FEWEST_DRAWN} s or more"
+        )
+    result = replace(result, facts={**result.facts, "warnings": warnings})
     inputs = [*recording.inputs()]
     if options.target is not None:
         inputs.append((options.target.name, sha256(options.target.read_bytes()).hexdigest()))

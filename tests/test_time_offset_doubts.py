@@ -48,6 +48,17 @@ def test_the_scale_of_one_axis_is_told() -> None:
     assert any("as far as" in text for text in alarms(told(scaled(wheels_imu(0, 0.02), 1.1))[1]))
 
 
+def test_turns_that_gaps_of_the_second_take_are_counted() -> None:
+    sample = pose_imu(path(0), 0, 0.03, 1e-3, 30.0)
+    assert isinstance(sample.reference, ImuSamples)
+    t = (sample.reference.t_ns - START_NS) * 1e-9
+    with_gaps = replace(sample, reference=sample.reference.select(t % 2 > 0.4))
+    fit, said = told(with_gaps)
+    assert abs(fit.td - sample.td) < 4 * fit.sigma < 1e-3
+    share = numbers(r"(\S+) % of the turns of cam0 fall into gaps of imu0", " ".join(alarms(said)))
+    assert share == [pytest.approx(100 * (0.4 + 0.05 + 0.12) / 2, abs=4)]  # gap, one turn's length, and the sweep to either side
+
+
 def test_degrees_taken_for_radians_are_named() -> None:
     sample = pose_imu(path(0), 0, 0.03, 1e-3, 30.0)
     with pytest.raises(BadInputError, match="--gyro-unit deg/s"):

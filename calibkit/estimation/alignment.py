@@ -124,15 +124,14 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
     measured by quiet ones would be kept by how well they fit the offset of the moment, which biases it.
     """
     d = len(a.R)
-    biases = {part.stretch.middle[0]: raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[1] for part in a.parts}
+    biases = iter([raw_residuals(part, a.track, a.R, a.shift(part.stretch.t))[1] for part in a.parts])
     squares = []
     for stretch, keep in zip(a.stretches, a.keep, strict=True):
         shift = a.shift(stretch.t)
         turned = stretch.beta(a.track, shift[:, None])
         left = stretch.turns.angle[:, stretch.axes] - turned[:, 0] @ a.R.T
-        own = biases.get(stretch.middle[keep][0]) if keep.any() else None
-        rate = left / stretch.turns.duration[:, None]
-        left = left - stretch.turns.duration[:, None] * (np.median(rate, axis=0) if own is None else own)
+        bias = next(biases) if a.parts and keep.sum() >= LEAST_TURNS else np.median(left / stretch.turns.duration[:, None], axis=0)
+        left = left - stretch.turns.duration[:, None] * bias
         D = np.tile(np.eye(d), (len(left), 1, 1)) if robust else stretch.noise(a.track, a.R, shift, a.shape).blocks(a.levels, d)
         squares.append(np.sum(left * np.linalg.solve(D, left[..., None])[..., 0], axis=1))
     typical = float(np.median(np.concatenate(squares)))

@@ -138,6 +138,8 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit, frame_hz: float | None) -> lis
     if lost > _LOST:
         verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
         found.append((verdict, f"{100 * lost:.0f} % of the turns of {of} contradict {to} and were given up: look at its poses"))
+    if fit.lost > _LOST:
+        found.append((Verdict.CHECK, f"{100 * fit.lost:.0f} % of the turns of {of} fall into gaps of {to} and tell nothing"))
     if not fit.alignment.converged:
         found.append((Verdict.FAIL, "the fit did not settle: the two streams do not fit together"))
     found += [(Verdict.FAIL, text) for text in _contrary(of, to, fit)]

@@ -158,8 +158,8 @@ def describe(clock: Clock, to: str, frame_hz: float | None = None) -> list[str]:
     Jumps by whole frame periods are named where the rate of the stamps of `of` is given.
     """
     if clock.too_short:
-        told = counted(clock.n_windows, "window of 5 s tells", "windows of 5 s tell")
-        return [f"too short to tell whether the clocks drift or jump: {told} td, {FEWEST} are needed"]
+        few = counted(clock.n_windows, "window of 5 s tells", "windows of 5 s tell")
+        return [f"too short to tell whether the clocks drift or jump: {few} td, {FEWEST} are needed"]
     said = []
     if clock.drifts:
         least, greatest = clock.skew_range

@@ -60,11 +60,12 @@ def time_offset_result(
     turned = f"  the rig file has it the other way round: {entry.equation}, {key} = -td"
     low, high = (fit.coarse_ns * 1e-9 + end for end in fit.interval)
     told = {"offset": fit.td, "sigma": sigma, "low": low, "high": high, "second": fit.second}
+    frame_hz = stamps[pair.of].rate_hz if pair.of in stamps else None
     facts = {
         "v": {name: told if known else dict.fromkeys(told)},
         "time_offset": {name: _facts(pair, fit, delays, bootstrap) if known else {"method": pair.method}},
         "t_zero_ns": {name: fit.alignment.track.origin_ns - fit.coarse_ns},
-        "lines": [*_lines(pair, fit, stamps[pair.of].rate_hz, delays, bootstrap, known), *([turned] if flipped and known else [])],
+        "lines": [*_lines(pair, fit, frame_hz, delays, bootstrap, known), *([turned] if flipped and known else [])],
     }
     return Result(
         stage="timeoffset",

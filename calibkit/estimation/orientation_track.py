@@ -177,7 +177,7 @@ def _smooth(t_ns: Times, q: Array, sigma: Array, held_s: float, walked: bool) ->
     if not np.any((chain[1:] >= 0) & (chain[1:] == chain[:-1])):
         noun = "gyroscope samples" if walked else "poses"
         raise BadInputError(f"{len(t)} {noun} come too unevenly to follow a motion: record without losses, with the sensor's own stamps")
-    gain = float(np.sqrt(np.median(power[chain >= 0])))
+    gain = float(np.sqrt(np.mean(power[chain >= 0])))
     if not walked:
         np.minimum(chain, 0, out=chain)
     return OrientationTrack(int(t_ns[0]), grid, fitted, rate, chain, delta, gain * sigma, _reach(interval))

@@ -28,7 +28,7 @@ _MOST = 64  # neighbours to either side
 _HELD = 3.5  # median intervals; how a sensor turned in a longer gap is not known
 _HELD_GYRO_S, _HELD_POSES_S = 0.03, 0.07  # unless it is shorter than this
 _PAUSE_S = 1.0  # longer gaps are left out of the grid
-_ENOUGH = 20_000  # samples that tell the noise
+_ENOUGH = 10_000  # samples that tell the noise
 _LEAST = 4  # samples between two pauses; fewer tell no motion, and are often wrong stamps
 
 

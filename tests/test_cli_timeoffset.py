@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterable
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,8 @@ def test_a_camera_before_a_board(run: Run, rich: Files, tmp_path: Path, monkeypa
     assert kept.cameras == load_rig(rich.lens).cameras  # what the rig file had is still there
     assert kept.provenance[-1].stage == "timeoffset"
     assert kept.provenance[-1].options["of"] == "cam0=corners"
+    digests = {file.name: file.sha256 for file in kept.provenance[-1].inputs}
+    assert digests["lens.yaml"] == sha256(rich.lens.read_bytes()).hexdigest()  # the lens decides
     found = json.loads(js.read_text())
     facts = found["facts"]["timeoffset"]["time_offset"]["dt_imu0_cam0"]
     assert facts["equation"] == "t_imu0 = t_cam0 + td"
@@ -460,6 +463,7 @@ def test_a_recording_that_does_not_turn_gives_no_number(run: Run, tmp_path: Path
     assert (found.value, found.sigma, found.status) == (None, None, Status.NOT_OBSERVABLE)
     facts = json.loads(js.read_text())["facts"]["timeoffset"]
     assert facts["time_offset"] == {"dt_imu0_cam0": {"method": "poses of the board"}}
+    assert "signal " not in said.out  # of what is not known
     assert set(facts["v"]["dt_imu0_cam0"].values()) == {None}
     assert json.loads(js.read_text())["not_observable"] == ["dt_imu0_cam0.offset"]
     assert run("report", out).code == 1

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from time_offset_samples import Sample, path, pose_imu
+from time_offset_samples import Sample, board_sample, path, pose_imu, told
 
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import make_time_offset
@@ -16,6 +16,9 @@ from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.estimation.time_offset_delay import Delays
 from calibkit.estimation.time_offset_result import Pair, time_offset_result
 from calibkit.report.view import views
+from calibkit.simulation.faults import apply_faults
+from calibkit.simulation.scenarios import SCENARIOS
+from calibkit.simulation.session import simulate_session
 
 Scatter = Callable[[np.random.Generator, int], np.ndarray]
 
@@ -193,9 +196,30 @@ def test_words() -> None:
     limit = constant.skew_limit * 1e6
     assert said == f"the clocks keep step: no jump, and a drift is below {limit:.2g} ppm ({limit * 0.06:.2g} ms over 60 s)"
     assert 0 < limit < 3
-    worse = _clock(360, 60, 5e-5, 0, scatter=lambda rng, w: 2 * rng.normal(size=w))
-    assert worse.scatter == pytest.approx(2, rel=0.15)
-    assert describe(worse, "imu0")[-1] == f"td of the windows scatters {worse.scatter:.1f} times as much as their sigmas say"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_jump_within_one_of_five_windows_is_no_drift_and_has_its_size(seed: int) -> None:
+    """-33 ms half-way through 25 s: seed 0's windows told -25 +- 6.5 ms, those of seed 1 a drift of -1755 ppm."""
+    session = apply_faults(simulate_session(replace(SCENARIOS["cam-imu"], duration_s=25.0), seed), ("image-step",))
+    sample = board_sample(session)
+    fit, said = told(sample)
+    assert fit.clock is not None
+    (jump,) = fit.clock.jumps
+    assert jump.size_s == pytest.approx(-0.033, abs=4 * jump.sigma_s)
+    assert jump.sigma_s < 3e-4
+    assert jump.t_s == pytest.approx(12.5, abs=0.06)
+    assert not fit.clock.drifts
+    before = float(fit.clock.t_ref_s < jump.t_s)
+    assert fit.td == pytest.approx(sample.td - 0.033 * (1 - before), abs=4 * fit.sigma)
+    assert fit.sigma < 1e-4
+    (reason,) = said.reasons
+    assert "the clock jumps: td changes by -3" in reason.text
+    result = time_offset_result(Pair("cam0", "imu0", "/cam0", "/imu0", "poses"), fit, Rig(), {}, Delays(), None)
+    drawn = views(result)[2].clock_line
+    assert drawn is not None
+    assert (drawn.skew, drawn.jumps) == (None, ((jump.t_s, jump.size_s),))
+    assert not any("drift" in line or "scatter" in line for line in result.facts["lines"])  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")

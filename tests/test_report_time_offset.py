@@ -84,23 +84,29 @@ def _set(unit, t, raw, sigma, context):
     return ResidualSet(SENSOR, unit, t_ns, raw, sigma, context)
 
 
-def result(status=Status.DETERMINED, **kwargs):
+def result(status=Status.DETERMINED, told=None, **kwargs):
+    """A result; `told` is what the stage says of the clock, its times counted from START_NS."""
     made, bottom = sets(**kwargs)
     known = status is not Status.NOT_OBSERVABLE
     estimate = Estimate(value=bottom["offset"] if known else None, sigma=bottom["sigma"] if known else None, unit="s", status=status)
     run = StageRun(stage="timeoffset", command="calibkit timeoffset rig.bag", calibkit="0.1")
     rig = Rig(time_offsets={SENSOR: make_time_offset("imu0", "cam0", estimate)}, provenance=[run])
-    return Result("timeoffset", rig, (), made, {"v": {SENSOR: bottom}})
+    facts = {"v": {SENSOR: bottom}}
+    if told is not None:
+        facts |= {"time_offset": {SENSOR: {"clock": told}}, "t_zero_ns": {SENSOR: START_NS}}
+    return Result("timeoffset", rig, (), made, facts)
 
 
 PICTURES_OF = {"v_curve", "rates", "residual_rate", "offset_over_time"}
+JUMPING = {"drifts": False, "skew": -4e-6, "jumps": [{"t": 31.0, "size": 0.033}]}
+DRIFTING = {"drifts": True, "skew": 50e-6, "jumps": []}
 CASES = {
     "good": {},
     "flat": {"size": 0.0, "td": 0.003, "status": Status.NOT_OBSERVABLE},
     "second": {"second": 0.045},
-    "jump": {"td": 0.0285, "clock": lambda t: 0.012 + 0.033 * (t > 31)},
+    "jump": {"td": 0.0285, "clock": lambda t: 0.012 + 0.033 * (t > 31), "told": JUMPING},
     "far": {"td": 83.0123, "far": True},
-    "drift": {"td": 0.005, "clock": lambda t: 0.005 + 50e-6 * (t - 30)},
+    "drift": {"td": 0.005, "clock": lambda t: 0.005 + 50e-6 * (t - 30), "told": DRIFTING},
     "scale": {"td": 0.005, "scale": 0.05},
 }
 
@@ -193,15 +199,18 @@ def test_rates_show_the_busiest_seconds_with_and_without_the_shift():
 
 def test_a_step_of_the_clock_is_marked_with_its_size_and_a_drift_in_ppm():
     said, figure = texts(result(**CASES["jump"]), "offset_over_time")
-    assert "the clocks run alike, with 1 step (dashed)" in said
+    assert "line: 1 jump (dashed)" in said
     assert "+33.00 ms" in said
-    (step,) = [line for line in figure.axes[0].lines if line.get_linestyle() == "--" and line.get_color() == ACCENT]
-    assert step.get_xdata()[0] == pytest.approx(32.5 - 1, abs=0.03)  # between the windows at 30 and 35 s, counted from the first turn
+    assert "ppm" not in said  # a skew that is no more than its sigma
+    assert "mean" not in said
+    (step,) = _marked(figure)
+    assert step.get_xdata()[0] == 31.0  # where the text has it, and not between the windows at 30 and 35 s
     assert len(figure.axes) == 2  # below: what the clock leaves
     assert "the clocks drift apart by +50 ppm" in texts(result(**CASES["drift"]), "offset_over_time")[0]
-    said, figure = texts(result(), "offset_over_time")
+    said, figure = texts(result(told={"drifts": False, "skew": 0.0, "jumps": []}), "offset_over_time")
     assert "the clocks run alike" in said
-    assert "step" not in said
+    assert "mean" in said
+    assert "jump" not in said
     assert len(figure.axes) == 1
 
 
@@ -213,8 +222,13 @@ def test_times_count_from_the_zero_that_the_stage_gives():
             said, figure = texts(zeroed, key)
             assert f"s after the first {label}" in said
             if key == "offset_over_time":
-                (step,) = [line for line in figure.axes[0].lines if line.get_linestyle() == "--" and line.get_color() == ACCENT]
-                assert step.get_xdata()[0] == pytest.approx(32.5 - 1 + later, abs=0.03)
+                assert [step.get_xdata()[0] for step in _marked(figure)] == ([31.0] if later else [])  # counted from that zero, if from any
+                first = figure.axes[0].containers[1].lines[0].get_xdata()[0]
+                assert first == pytest.approx(5.0 - 1 + later, abs=0.03)
+
+
+def _marked(figure):
+    return [line for line in figure.axes[0].lines if line.get_linestyle() == "--" and line.get_color() == ACCENT]
 
 
 def test_growth_is_found_with_its_size_and_noise_has_none():
@@ -239,6 +253,15 @@ def test_good_recordings_raise_no_signal():
         assert not_good(found.values()) == ()
         assert {"over_before", "window_scatter"} <= set(found)
     assert not_good(signals_of(result(**CASES["flat"])).values()) == ()
+
+
+def test_an_offset_that_is_not_known_has_no_signals():
+    """Even where turns and windows disagree by far: there is nothing to believe, or not to."""
+    made = result(**CASES["scale"] | {"clock": lambda t: 0.005 + 1e-3 * np.sin(t)})
+    assert len(signals_of(made)) == 3
+    assert signals_of(_changed(made, 2, raw=np.full((W, 1), 0.01)))["window_scatter"].verdict is Verdict.CHECK
+    unknown = result(**CASES["scale"] | {"status": Status.NOT_OBSERVABLE})
+    assert signals_of(unknown) == {}
 
 
 def test_a_wrong_scale_shows_as_growth_with_the_rate():
@@ -335,6 +358,10 @@ def _rows(made, rows):
 
 N, K, W = (len(one.raw) for one in sets()[0])
 ODD_ROWS = np.arange(N) % 2 == 1
+ODD_CLOCK = {
+    "time_offset": {SENSOR: {"clock": {"drifts": True, "skew": "1", "jumps": [1, {"t": "x"}, {"t": 1e300, "size": 0.1}]}}},
+    "t_zero_ns": {SENSOR: START_NS},
+}
 ODD = {
     "no facts": lambda r: replace(r, facts={}),
     "facts of another kind": lambda r: replace(r, facts={"v": [1]}),
@@ -367,6 +394,7 @@ ODD = {
     "sigma zero": lambda r: _changed(r, 2, window_sigma=np.zeros(W)),
     "sigma in part": lambda r: _changed(r, 2, window_sigma=np.where(np.arange(W) % 2, np.nan, 1e-4)),
     "sigma absurd": lambda r: _changed(r, 2, window_sigma=np.where(np.arange(W) % 2, 1e8, 1e-12)),
+    "clock told oddly": lambda r: replace(_changed(r, 2), facts={**r.facts, **ODD_CLOCK}),
     "no clock": lambda r: _changed(r, 2, clock=np.full(W, np.nan)),
     "one clock": lambda r: _changed(r, 2, clock=np.where(np.arange(W) == 3, 0.012, np.nan)),
     "clock absurd": lambda r: _changed(r, 2, clock=np.where(np.arange(W) % 2, 1e8, -1e8)),

@@ -51,6 +51,22 @@ def test_a_clock_that_drifts_or_jumps_or_a_long_gap_is_no_jitter() -> None:
     assert [f.code for f in doctor.check_times(jumped) if f.problem] == ["irregular"]
 
 
+@pytest.mark.parametrize("hz", [10.0, 20.0, 29.97])
+@pytest.mark.parametrize("jitter_s", [0.0, 1e-4])
+def test_one_jump_in_a_short_recording_is_no_jitter_and_no_other_rate(hz: float, jitter_s: float) -> None:
+    t_ns, _ = _stamps(250, hz, jitter_s)
+    for at in (40, 125, 160, 240):
+        for jump_ns in (-33_000_000, 15_000_000, 33_000_000):
+            report = check_stamps(t_ns + jump_ns * (np.arange(250) >= at))
+            assert report.jitter_s == pytest.approx(jitter_s, rel=0.25, abs=1e-9)
+            assert report.rate_hz == pytest.approx(hz, rel=1e-9 + jitter_s)  # 33 ms are 0.4 ms off a period of 29.97 Hz
+
+
+def test_stamps_are_of_what_the_stream_has() -> None:
+    t_ns, _ = _stamps(100, 30)
+    assert describe(check_stamps(np.repeat(t_ns, 2), "pose")) == ["100 poses have the stamp of another"]
+
+
 def test_faults_of_a_recording_are_named_with_their_size() -> None:
     run = simulate_session(SCENARIOS["cam-imu"], 0)
     n = len(run.tracks[0].stamp_ns)
@@ -127,7 +143,7 @@ def test_a_wild_stamp_is_named_and_no_other_is_missing(seconds: float, off: str)
     t_ns[6000] += np.int64(seconds * 1e9)
     report = check_stamps(t_ns)
     assert (report.far, report.missing, report.backward, report.rate_hz) == (1, 0, 0, pytest.approx(200))
-    assert describe(report, "sample") == [f"1 sample has a stamp {off} off all others"]
+    assert describe(report) == [f"1 frame has a stamp {off} off all others"]
     assert report.jitter_s == pytest.approx(0, abs=1e-8)
 
 

@@ -1,5 +1,6 @@
 """The time offset's equations: SPEC's worked examples exactly, columns against differences, eliminations against dense ones, and signs."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from calibkit.data.observations import ImuSamples
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import make_time_offset
 from calibkit.data.verdict import Status
+from calibkit.errors import BadInputError
 from calibkit.estimation.alignment import Alignment, axis_offsets, columns, newton, sweep, weighed, window_offsets
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro
 from calibkit.estimation.rough_offset import masked_correlation, rough_offsets
@@ -338,3 +340,24 @@ def test_both_directions_of_a_pair_agree() -> None:
     back = Sample(turns_of_poses(one), one.t_ns, other, -td).fitted
     assert abs(forward.td + back.td) < 3 * (forward.sigma + back.sigma)
     np.testing.assert_allclose(so3.log(forward.alignment.R @ back.alignment.R), 0, atol=3e-3)
+
+
+def test_an_interval_that_holds_zero_lets_the_stamps_be() -> None:
+    fit = pose_imu(path(0), 0, 0.01, 1e-3, 10.0).fitted
+    pair = Pair("cam0", "imu0", "/cam0", "/imu0", "poses")
+    kept = "; the stamps as they are lie within the interval"
+    for half, holds in ((1e-3, False), (2e-2, True)):
+        wide = replace(fit, interval=(fit.alignment.tau - half, fit.alignment.tau + half))
+        lines = time_offset_result(pair, wide, Rig(), {}, Delays(), None).facts["lines"]
+        assert isinstance(lines, list)
+        assert lines[1].endswith(kept) is holds
+        assert re.search(r"once corrected its sigma still costs \S+ mrad at \S+ rad/s$", lines[3])
+
+
+def test_few_turns_in_a_long_recording_are_no_lack_of_time() -> None:
+    sample = pose_imu(path(0), 0, 0.01, 1e-3, 20.0)
+    every = np.arange(0, len(sample.turns.first), len(sample.turns.first) // 8)
+    turns = sample.turns
+    few = Turns(turns.t_ns, turns.first[every], turns.last[every], turns.angle[every])
+    with pytest.raises(BadInputError, match=r"only \d turns of the first could be told from its \d+ stamps"):
+        fit_time_offset(few, sample.reference, Settings())

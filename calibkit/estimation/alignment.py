@@ -185,14 +185,29 @@ def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
     return np.asarray(square - np.sum(pull * np.linalg.solve(H, pull), axis=0), np.float64)
 
 
-def window_offsets(a: Alignment, reach: float) -> Windows:
+def window_offsets(a: Alignment, reach: float, halved: bool = False) -> Windows:
     """Return the offset of each part by itself: the bottom of its own V, where it has one, then Gauss-Newton.
 
     It is looked for within `reach`, and further where it lies at the edge: a clock that jumps leaves whole stretches far from the others.
+    A part with a jump inside has an offset on each side of it; `halved`, on each side of its middle.
     """
-    found = [_window(a, part, reach) for part in a.parts]
+    jumps = [jump.t_s for jump in a.clock.jumps] if a.clock else []
+    cuts = [[float(part.stretch.t[[0, -1]].mean())] if halved else jumps for part in a.parts]
+    found = [_window(a, piece, reach) for part, at in zip(a.parts, cuts, strict=True) for piece in _cut(a, part, at)]
     rows = np.array([row for row in found if row is not None], float).reshape(-1, 4)
     return Windows(*(rows[:, k] for k in range(4)))
+
+
+def _cut(a: Alignment, part: Weighed, at: list[float]) -> list[Weighed]:
+    """Return the part, or what it has of turns on each side of some times."""
+    stretch = part.stretch
+    inside = [t for t in at if stretch.t[0] < t < stretch.t[-1]]
+    if not inside:
+        return [part]
+    first, last = (np.searchsorted(inside, stretch.t[end]) for end in (stretch.turns.first, stretch.turns.last))
+    between = [(first == k) & (last == k) for k in range(len(inside) + 1)]
+    cut = [Stretch(stretch.turns.select(keep), stretch.origin_ns, stretch.free_bias) for keep in between if keep.sum() >= LEAST_TURNS]
+    return [weigh(piece, piece.noise(a.track, a.R, a.shift(piece.t), a.shape), a.levels) for piece in cut]
 
 
 def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, float, float] | None:

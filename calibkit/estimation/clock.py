@@ -20,8 +20,6 @@ Kind = Literal["constant", "drifting", "jumping"]
 FEWEST = 4  # windows; below, nothing is said of the clock
 _CONFIDENT = 1.96  # 95 %
 _SIGNIFICANT = 4.0  # sigmas: the price of a skew
-_WORSE = 1.3  # scatter that is worth telling
-_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 _JUMPS_TOLD = 5  # one by one
 _HUNDREDTHS = 0.05  # s
 
@@ -56,7 +54,6 @@ class Clock:
     middle_s: float
     half_s: float
     jumps: tuple[Jump, ...]
-    scatter: float  # robust sigma of the windows around the clock over their own sigmas, 1 or more
     gain: float  # -2 ln likelihood below that of a constant clock
     price: float  # what the gain had to exceed; 0 for a constant clock
     span_s: float  # from the first window's start to the last one's end
@@ -131,7 +128,6 @@ def _clock(windows: Windows, fit: Fit, constant: Fit) -> Clock:
             Jump((low + high) / 2, (high - low) / float(np.sqrt(12)), float(fit.beta[i]), sigma_of(windows, fit, np.eye(len(fit.beta))[i]))
             for i, (low, high) in enumerate(places, first)
         ),
-        scatter=max(1.0, _MAD * float(np.median(np.abs(fit.residual))) * float(np.sqrt(n / max(n - len(fit.beta), 1)))),
         gain=constant.cost - fit.cost,
         price=chosen.price(n),
         span_s=float(windows.end_s.max() - windows.start_s.min()),
@@ -176,8 +172,6 @@ def describe(clock: Clock, to: str, frame_hz: float | None = None) -> list[str]:
     if not said:
         limit = f"{clock.skew_limit * 1e6:.2g} ppm ({clock.skew_limit * clock.span_s * 1e3:.2g} ms over {clock.span_s:.4g} s)"
         said.append(f"the clocks keep step: no jump, and a drift is below {limit}")
-    if clock.scatter > _WORSE:
-        said.append(f"td of the windows scatters {clock.scatter:.1f} times as much as their sigmas say")
     return said
 
 

@@ -26,6 +26,7 @@ _ALIKE = 0.8  # of the best coherence; a multiple of the best period that is as 
 _COHERENT = 0.3  # mean resultant length of a block; jitter of a quarter of the period leaves 0.29, no grid 0.16
 _BURST, _IN_BURSTS = 0.2, 0.4  # of the mean interval; share of intervals below it
 _TOLD = 0.005  # of the period: less jitter is not worth a sentence
+_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 _FAR = 4.0  # sigmas: stamps further off are wrong, and no jitter
 
 
@@ -44,6 +45,7 @@ class StampReport:
     jitter_s: float | None  # rms of the stamps around the grid
     jitter_sigma_s: float | None
     bursts: bool  # several at once, then none: times of arrival
+    noun: str = "frame"  # what has a stamp
 
     @property
     def rate_hz(self) -> float | None:
@@ -64,8 +66,8 @@ class StampReport:
         return self.missing / max(self.expected, 1)
 
 
-def check_stamps(t_ns: Times) -> StampReport:
-    """Return what the stamps (n,) of a stream, in the order of the recording, say of themselves."""
+def check_stamps(t_ns: Times, noun: str = "frame") -> StampReport:
+    """Return what the stamps (n,) of a stream, in the order of the recording, say of themselves; `noun` is what has a stamp."""
     zeros = _unset(t_ns)
     stamps = t_ns[~zeros]
     far, far_s = _far_off(stamps)
@@ -97,6 +99,7 @@ def check_stamps(t_ns: Times) -> StampReport:
         jitter_s=jitter,
         jitter_sigma_s=sigma,
         bursts=bursts,
+        noun=noun,
     )
 
 
@@ -155,6 +158,10 @@ def _period(t_s: Array) -> float:
         spans = t_s[first + lag] - t_s[first]
         spans = spans[spans < 8 * typical * lag] / period
         turn = np.angle(np.mean(np.exp(2j * np.pi * spans))) / (2 * np.pi)
+        off = spans - turn
+        off -= np.rint(off)
+        apart = np.abs(off - np.median(off))  # spans across a jump are far off, all on one side
+        turn += np.mean(off[apart <= _FAR * _MAD * np.median(apart)])
         period *= 1 + float(turn / np.mean(spans))
         lag *= 2
     return period
@@ -175,19 +182,22 @@ def _phases(t_s: Array, period: float) -> tuple[Array, float]:
 
 
 def _jitter(t_s: Array, period: float, offset: Array) -> tuple[float, float]:
-    """Return the rms of the stamps around the grid in s, and its sigma; wrong stamps apart."""
+    """Return the rms of the stamps around the grid in s, and its sigma; wrong stamps and blocks in which the clock jumps apart."""
     off = t_s / period - offset
     off = (off - np.rint(off)) * period
-    spread = 1.4826 * float(np.median(np.abs(off)))
+    _, block = np.unique(offset, return_inverse=True)
+    square = np.bincount(block, off**2) / np.bincount(block)
+    off = off[(square <= _FAR**2 * np.median(square))[block]]
+    spread = _MAD * float(np.median(np.abs(off)))
     good = off[np.abs(off) <= _FAR * spread] if spread > 0 else off
     freedom = len(good) * (1 - 1 / _BLOCK)  # each block has a phase of its own
     rms = float(np.sqrt(np.sum(good**2) / max(freedom, 1)))
     return rms, rms / float(np.sqrt(2 * max(freedom, 1)))
 
 
-def describe(report: StampReport, noun: str = "frame", from_share: float = 0.0, from_jitter_s: float = 0.0) -> list[str]:
-    """Return what is wrong with the stamps, in sentences; `noun` is what has a stamp; both sizes are the least that is told."""
-    said = []
+def describe(report: StampReport, from_share: float = 0.0, from_jitter_s: float = 0.0) -> list[str]:
+    """Return what is wrong with the stamps, in sentences; both sizes are the least that is told."""
+    said, noun = [], report.noun
     rate = f", the rate is {report.rate_hz:.4g} Hz" if report.rate_hz else ""
     if report.missing and report.missing_share >= from_share:
         said.append(f"{_plain(100 * report.missing_share, 3)} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")

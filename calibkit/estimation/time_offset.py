@@ -49,6 +49,7 @@ _PROFILE = 41
 _LEAST_SHARE = 1e-6  # of the information that is taken for real
 _CONTRADICTED = 12.25  # chi-squared of one degree of freedom: 3.5 sigma
 _TURNING, _OTHER_UNIT = 0.1, 0.4  # rad/s; of the logarithm
+_FEW_WINDOWS = 12
 _CLOCKS = 4  # times that a clock is looked at
 
 
@@ -231,7 +232,7 @@ def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignme
         if not len(windows.tau):
             break
         middle = (windows.start + windows.stop) / 2
-        clock = placed(a, fit_clock(middle, windows.start, windows.stop, windows.tau, windows.sigma))
+        clock = placed(a, _clock_of(a, windows, reach))
         if clock.kind == "constant" and (a.clock is None or a.clock.kind == "constant"):
             return replace(a, clock=clock), windows
         change = np.abs(clock.at(middle) - a.shift(middle))
@@ -241,6 +242,21 @@ def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignme
         a = settle(a, settings.levels)
         windows = window_offsets(a, reach)
     return a, windows
+
+
+def _clock_of(a: Alignment, windows: Windows, reach: float) -> Clock:
+    """Return the clock of the windows; where few of them drift, that of their halves if those jump.
+
+    A jump inside one of a few windows, which then has an offset between the two, looks like a drift.
+    """
+    clock = fit_clock((windows.start + windows.stop) / 2, windows.start, windows.stop, windows.tau, windows.sigma)
+    if clock.kind != "drifting" or len(windows.tau) >= _FEW_WINDOWS:
+        return clock
+    halves = window_offsets(a, reach, halved=True)
+    if len(halves.tau) <= len(windows.tau):
+        return clock
+    finer = fit_clock((halves.start + halves.stop) / 2, halves.start, halves.stop, halves.tau, halves.sigma)
+    return finer if finer.jumps else clock
 
 
 def _grid(a: Alignment, step: float, reach: float) -> Array:

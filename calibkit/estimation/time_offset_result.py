@@ -105,15 +105,16 @@ def _lines(pair: Pair, fit: TimeOffsetFit, frame_hz: float | None, delays: Delay
     unit, scale = ("ms", 1e3) if abs(fit.td) < 1 else ("s", 1.0)
     digits = int(np.clip(1 - np.floor(np.log10(max(scale * fit.sigma, 1e-9))), 1, 9))
     td, low, high = (f"{scale * value:+.{digits}f}" for value in (fit.td, *ends))
+    as_they_are = "; the stamps as they are lie within the interval" if ends[0] <= 0 <= ends[1] else ""
     lines += [
-        f"  t_{pair.to} = t_{pair.of} + td: {early_or_late(pair.of, fit.td)}",
+        f"  t_{pair.to} = t_{pair.of} + td: {early_or_late(pair.of, fit.td)}{as_they_are}",
         f"  td {td} +- {scale * fit.sigma:.{digits}f} {unit}; 95 %: {low} to {high} {unit} (profile likelihood)"
         + ("" if bootstrap is None else f"; bootstrap over stretches: +- {bootstrap * 1e3:.2g} ms"),
     ]
     if abs(fit.td) < 1:
         costs = [f"{smear(rate, fit.td, pair.focal_px)} at {rate:.2g} rad/s" for rate in (middle, fast)]
         left = smear(fast, fit.sigma, pair.focal_px)
-        lines.append(f"  left uncorrected it costs {' and '.join(costs)}; once corrected its sigma still costs {left}")
+        lines.append(f"  left uncorrected it costs {' and '.join(costs)}; once corrected its sigma still costs {left} at {fast:.2g} rad/s")
     if fit.clock is not None:
         lines += [f"  {text}" for text in describe(fit.clock, pair.to, frame_hz)]
         if fit.clock.kind != "constant":
@@ -159,6 +160,7 @@ def _facts(pair: Pair, fit: TimeOffsetFit, delays: Delays, bootstrap: float | No
         else {
             "kind": clock.kind,
             "t_of_td": clock.t_ref_s,
+            "drifts": clock.drifts,
             "skew": clock.skew,
             "skew_sigma": clock.skew_sigma if np.isfinite(clock.skew_sigma) else None,
             "jumps": [{"t": jump.t_s, "t_sigma": jump.t_sigma_s, "size": jump.size_s, "sigma": jump.sigma_s} for jump in clock.jumps],

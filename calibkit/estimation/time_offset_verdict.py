@@ -47,7 +47,7 @@ class Judged:
 def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: dict[str, StampReport]) -> Judged:
     """Return status and reasons of `name` = dt_to_of."""
     why = _not_observable(of, to, fit)
-    found = [(sensor, text) for sensor, report in stamps.items() for text in stamps_in_words(report, "frame", _MISSING, _JITTER_S)]
+    found = [(sensor, text) for sensor, report in stamps.items() for text in stamps_in_words(report, _MISSING, _JITTER_S)]
     spoilt = [Reason(Verdict.CHECK, f"{sensor}: {text}") for sensor, text in found]
     scale = [Reason(verdict, f"{name}: {text}") for verdict, text in _scale(of, to, fit)]
     if why:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.observations import Times
+from calibkit.data.plural import counted
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.turn_noise import NoiseLevels, TurnNoise, Whitener, turn_noise
 from calibkit.estimation.turns import Turns
@@ -20,6 +21,7 @@ from calibkit.geometry.so3 import Array
 
 STRETCH_S = 5.0
 LEAST_TURNS = 8  # in a stretch
+_FEW_TURNS = 20
 _UNEVEN = 0.5  # of the time the track must be known for as long as a turn takes
 TILT = 0.5  # rad; what a rotation that nothing tells may be off by: keeps its elimination finite
 
@@ -167,6 +169,12 @@ def lost_to_gaps(turns: Turns, track: OrientationTrack, low: float, high: float)
 
 def why_so_few(turns: Turns, track: OrientationTrack, reach: float) -> str:
     """Say why hardly a turn can be compared, at whatever offset."""
+    if (many := len(turns.first)) < _FEW_TURNS <= len(turns.t_ns):
+        return (
+            f"only {counted(many, 'turn')} of the first could be told from its {len(turns.t_ns)} stamps: "
+            "poses that come steadily are needed; "
+            "a camera without a board must also move, before near things full of texture (or give --target, --plain)"
+        )
     if len(turns.first) and track.followed(float(np.median(turns.duration)) + 2 * reach) < _UNEVEN:
         return (
             "the samples of the second come too unevenly to follow it through the turns of the first: "

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 
 from calibkit.data.plural import counted
 from calibkit.report.look import ACCENT, INK, PALE
-from calibkit.report.view import Array, Bottom, View, given
+from calibkit.report.view import Array, Bottom, ClockLine, View, given
 
 LIMIT = 3.84  # chi-squared of one parameter at 95 %
 FLAT = 5 * LIMIT  # a curve that stays below is drawn no taller: a flat bowl must look flat
-MAX_STEPS = 20  # that are marked
+MAX_STEPS = 20  # jumps that are marked
 FEWEST = 4  # windows that tell a clock's drift, as the estimator has it
 
 
@@ -49,7 +49,7 @@ def v_curve(figure: Figure, view: View) -> None:
         panel, said = figure.subplots(), f"{_shown(bottom)}, beyond what was tried"
     else:
         panel, near = figure.subplots(1, 2, width_ratios=[1.7, 1])
-        _near(near, tau, cost, bottom, axis)
+        _near(near, bottom, axis)
         said = _shown(bottom)
     figure.suptitle(f"t_{a} = t_{b} + td:  {said}", fontsize=11, fontweight="bold", color=INK)
     panel.plot(axis(tau), cost, "-", color=INK, lw=1.2, marker=".", ms=2.5)
@@ -84,16 +84,17 @@ def _table(panel: Axes, tau: Array, cost: Array, bottom: Bottom, axis: Seconds) 
         panel.annotate(text, (at, height), (0, 10), textcoords="offset points", ha="center", va="bottom", color="black")
 
 
-def _near(panel: Axes, tau: Array, cost: Array, bottom: Bottom, axis: Seconds) -> None:
-    """Draw the bottom alone: the tried offsets and, between them, the parabola that meets the limit at both ends of the interval."""
+def _near(panel: Axes, bottom: Bottom, axis: Seconds) -> None:
+    """Draw the bottom alone: the parabola that meets the limit at both ends of the interval.
+
+    The offsets that were tried are no part of it: they lie above the lowest of them, and what residuals share is not in their cost.
+    """
     half = max(bottom.high - bottom.offset, bottom.offset - bottom.low)
     x = np.linspace(-2 * half, 2 * half, 201)
     side = np.maximum(np.where(x < 0, bottom.offset - bottom.low, bottom.high - bottom.offset), 1e-3 * half)
-    tried = np.abs(tau - bottom.offset) <= 2 * half
     panel.axvspan(*axis(np.array([bottom.low, bottom.high])), color=PALE, alpha=0.5, lw=0)
     _limit(panel)
     panel.plot(axis(bottom.offset + x), LIMIT * (x / side) ** 2, color=INK, lw=1.2)
-    panel.plot(axis(tau[tried]), cost[tried], ".", color=INK, ms=6)
     panel.plot(axis(np.array([bottom.offset])), [0], "v", color=ACCENT, ms=8, mec="white", clip_on=False, zorder=4)
     panel.set(xlim=axis(bottom.offset + x[[0, -1]]), ylim=(-0.2 * LIMIT, 4 * LIMIT), xlabel=axis.label("tau"))
     panel.locator_params(axis="x", nbins=5)
@@ -106,7 +107,7 @@ def _limit(panel: Axes) -> None:
 
 
 def offset_over_time(figure: Figure, view: View) -> None:
-    """Draw the offset of each window and, where td is known, their mean and the clock fitted to them; below, what a moving one leaves."""
+    """Draw the offset of each window and, where td is known, the clock fitted to them or their mean; below, what a moving one leaves."""
     order = np.argsort(given(view.t), kind="stable")
     t, offset, sigma = (given(column)[order] for column in (view.t, view.window_offset, view.window_sigma))
     sigma = np.where(sigma > 0, np.maximum(sigma, 1e-12), np.nan)
@@ -122,13 +123,13 @@ def offset_over_time(figure: Figure, view: View) -> None:
     said = ["bars of 2 sigma"]
     if view.bottom is None:
         said.append("this recording does not tell td")
-    else:
+    elif view.clock_line is None or (view.clock_line.skew is None and not view.clock_line.jumps):  # a clock that moves has no mean
         weight = sigma[sure] ** -2.0 if np.isfinite(sigma).any() else np.ones(len(t))
         mean = float(np.average(offset[sure], weights=weight))
         panels[0].axhline(float(axis(np.array(mean))), color="black", lw=0.9, ls=(0, (1, 2)))
         said.append(f"dotted: mean {ms(mean, float(weight.sum() ** -0.5))}")
     if len(known) and view.bottom is not None:
-        said.append("line: " + _clock(panels[0], t[np.isfinite(clock)], known, sigma[np.isfinite(clock)], axis))
+        said.append("line: " + _clock(panels[0], t[np.isfinite(clock)], known, view.clock_line, axis))
     if not sure.all():
         said.append(f"pale: {counted(int(np.sum(~sure)), 'window')} of large sigma")
     panels[0].set(ylabel=axis.label("td"), title="; ".join(said))
@@ -147,24 +148,22 @@ def _bars(panel: Axes, t: Array, value: Array, sigma: Array, sure: "np.ndarray[t
         panel.errorbar(t[rows], value[rows], 2 * np.nan_to_num(sigma[rows]), fmt="o", color=colour, ms=size, lw=0.9, capsize=size / 2)
 
 
-def _clock(panel: Axes, t: Array, clock: Array, sigma: Array, axis: Seconds) -> str:
-    """Draw the clock's line (n,), broken and marked at its steps, and say in words what it does."""
-    span = np.maximum(np.diff(t), 1e-9)
-    skew = float(np.median(np.diff(clock) / span)) if len(t) > 1 else 0.0
-    step = np.diff(clock) - skew * span
-    least = 3 * float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else 0.0
-    ends = np.flatnonzero(np.abs(step) > max(least, 1e-6)) + 1
-    for piece in np.split(np.arange(len(t)), ends):
+def _clock(panel: Axes, t: Array, clock: Array, told: ClockLine | None, axis: Seconds) -> str:
+    """Draw the clock's line (n,), broken and marked at its jumps, and say in words what it does."""
+    jumps = [] if told is None else sorted(told.jumps)
+    for piece in np.split(np.arange(len(t)), np.searchsorted(t, [at for at, _ in jumps])):
         panel.plot(t[piece], axis(clock[piece]), "-" if len(piece) > 1 else "_", color=ACCENT, lw=1.4, ms=14, zorder=3)
-    for end in ends[:MAX_STEPS]:
-        at = float(t[end - 1] + t[end]) / 2
+    for at, size in jumps[:MAX_STEPS]:
         panel.axvline(at, color=ACCENT, lw=0.9, ls="--", zorder=0)
-        top, text = panel.get_xaxis_transform(), ms(float(step[end - 1]), 1e-4)
+        top, text = panel.get_xaxis_transform(), ms(size, 1e-4)
         panel.annotate(text, (at, 1), (5, -2), xycoords=top, textcoords="offset points", va="top", color=ACCENT, fontweight="bold")
     if len(t) < FEWEST:
         return "too few windows to tell whether the clocks drift"
-    drift = "the clocks run alike" if abs(skew) < 1e-8 else f"the clocks drift apart by {1e6 * skew:+.3g} ppm"
-    return drift + (f", with {counted(len(ends), 'step')} (dashed)" if len(ends) else "")
+    if told is None:
+        return "the clock"
+    drift = [] if told.skew is None else [f"the clocks drift apart by {1e6 * told.skew:+.3g} ppm"]
+    steps = [f"{counted(len(jumps), 'jump')} (dashed)"] if jumps else []
+    return ", with ".join([*drift, *steps]) or "the clocks run alike"
 
 
 def since(view: View) -> str:

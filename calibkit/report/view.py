@@ -34,6 +34,14 @@ class Bottom:
 
 
 @dataclass(frozen=True)
+class ClockLine:
+    """What the model of a clock does over time."""
+
+    skew: float | None  # s/s; None: no drift to speak of
+    jumps: tuple[tuple[float, float], ...]  # when, s since the stage's zero, and by how much, s
+
+
+@dataclass(frozen=True)
 class View:
     """Residuals of one sensor in one stage; what the stage did not record is None."""
 
@@ -68,6 +76,7 @@ class View:
     window_offset: Array | None = None  # (n,) s of one window alone: raw is that less the clock's
     window_sigma: Array | None = None  # (n,) s
     clock: Array | None = None  # (n,) s the offset that the model of the clock has there
+    clock_line: ClockLine | None = None
     bottom: Bottom | None = None  # None: there is none, or the rig says that the offset is not observable
     turn: Array | None = None  # (n, 3) rad of a pose beside raw's m, local(Z Q, P X)
     place: Array | None = None  # (n, 3) m, and
@@ -191,6 +200,7 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         window_offset=floats("window_offset"),
         window_sigma=partly("window_sigma"),
         clock=partly("clock"),
+        clock_line=_clock_line(result, residuals.sensor),
         bottom=_bottom(result, residuals.sensor),
         turn=floats("turn", 3),
         place=floats("place", 3),
@@ -223,14 +233,28 @@ def _bottom(result: Result, sensor: str) -> Bottom | None:
     if not isinstance(found, Mapping) or (entry is not None and entry.offset.value is None):
         return None
 
-    def seconds(key: str) -> float | None:
-        value = found.get(key)
-        return float(value) if isinstance(value, int | float) and abs(value) < _ABSURD else None
-
-    offset, low, high = seconds("offset"), seconds("low"), seconds("high")
+    offset, low, high, second = (_number(found.get(key)) for key in ("offset", "low", "high", "second"))
     if offset is None or low is None or high is None or not low <= offset <= high or low == high:
         return None
-    return Bottom(offset, low, high, seconds("second"))
+    return Bottom(offset, low, high, second)
+
+
+def _clock_line(result: Result, sensor: str) -> ClockLine | None:
+    """Return facts["time_offset"][sensor]["clock"] where there is one and the stage gives the zero of its times."""
+    found: object = result.facts
+    for key in ("time_offset", sensor, "clock"):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    if not isinstance(found, Mapping) or _zero(result, sensor) is None:
+        return None
+    told = found.get("jumps")
+    told = [jump for jump in told if isinstance(jump, Mapping)] if isinstance(told, list) else []
+    jumps = [(_number(jump.get("t")), _number(jump.get("size"))) for jump in told]
+    known = tuple((t, size) for t, size in jumps if t is not None and size is not None)
+    return ClockLine(_number(found.get("skew")) if found.get("drifts") is True else None, known)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and abs(value) < _ABSURD else None
 
 
 def _frames(facts: Mapping[str, object], sensor: str, frame: NDArray[np.generic] | None) -> tuple[Index | None, tuple[str, ...]]:

@@ -26,6 +26,7 @@ from calibkit.stages.sensors import Sensor, choose_pair, find_sensors
 
 _DEFAULT = ImuOptions()
 _NO_DELAYS = Delays()
+_STAMPED = {"image": "frame", "corners": "frame", "pose": "pose", "tf": "pose"}  # what has a stamp
 _FEWEST_DRAWN = 9  # stretches; the spread over draws of fewer says more of chance than of td
 
 
@@ -77,7 +78,7 @@ def time_offset(
         raise BadInputError(f"{recording.name}: {of.name} and {to.name}: {error}") from None
     few = len(fit.alignment.parts) < _FEWEST_DRAWN
     spread = bootstrap_sigma(fit, options.bootstrap) if options.bootstrap and not few else None
-    stamps = {sensor.name: check_stamps(seen.t_ns) for sensor, seen in ((of, seen_of), (to, seen_to))}
+    stamps = {sensor.name: check_stamps(seen.t_ns, _STAMPED.get(sensor.kind, "sample")) for sensor, seen in ((of, seen_of), (to, seen_to))}
     result = time_offset_result(pair, fit, base, stamps, options.delays, spread)
     warnings = [*recording.warnings, *reader.warnings]
     if options.bootstrap and few:
@@ -86,9 +87,8 @@ def time_offset(
             f"--bootstrap: {there} of 5 s are too few to draw from, {_FEWEST_DRAWN} are needed: record {5 * _FEWEST_DRAWN} s or more"
         )
     result = replace(result, facts={**result.facts, "warnings": warnings})
-    inputs = [*recording.inputs()]
-    if options.target is not None:
-        inputs.append((options.target.name, sha256(options.target.read_bytes()).hexdigest()))
+    read = [*outputs.rigs, *([options.target] if options.target else [])]  # the lens, and the board
+    inputs = [*recording.inputs(), *((path.name, sha256(path.read_bytes()).hexdigest()) for path in read)]
     return save(result, base, outputs, inputs, _told(options, of, to))
 
 

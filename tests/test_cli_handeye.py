@@ -99,12 +99,16 @@ def test_pairs_to_a_rig_file_with_its_residuals_report_and_json(run: Run, tmp_pa
     rig, report, js = tmp_path / "rig.yaml", tmp_path / "report", tmp_path / "h.json"
     said = run(*pairs.asked, "-o", rig, "--report", report, "--json", js, "--predict", "40")
     assert said.code == 0, said
+    assert re.search(r"with 40 more good poses: p to \([\d.]+, [\d.]+, [\d.]+\) mm, R to", said.out)
     assert_found(rig)
     assert_found(rig, "T_base_target", Z, within=2e-3)
     kept = load_rig(rig)
     assert kept.transforms["T_gripper_cam"].equation == "p_gripper = T_gripper_cam p_cam"
     assert kept.transforms["T_gripper_cam"].inverse_name == "T_cam_gripper"
-    assert kept.transforms["T_gripper_cam"].verdict is Verdict.PASS
+    assert kept.transforms["T_gripper_cam"].verdict is Verdict.CHECK  # until --setup is given
+    assert "confirm it with --setup eye-in-hand" in kept.transforms["T_gripper_cam"].reasons[0]
+    assert run(*pairs.asked, "--setup", "eye-in-hand", "-o", tmp_path / "told.yaml").code == 0
+    assert load_rig(tmp_path / "told.yaml").transforms["T_gripper_cam"].verdict is Verdict.PASS
     assert kept.provenance[-1].options["setup"] == "eye-in-hand"
     assert "eye-in-hand (the camera on the gripper): it fits" in said.out
     assert "24 of 24 poses used" in said.out
@@ -152,6 +156,9 @@ def test_poses_the_other_way_round_are_told(run: Run, tmp_path: Path) -> None:
     said = run(*pairs.asked, "--setup", "eye-in-hand")
     assert said.code in (1, 3)
     assert re.search(r"FAIL +T_gripper_cam: --setup eye-to-hand .*--inverse-poses\), fits \d+ times better", said.out)
+    assert "FAIL  T_gripper_cam: --setup" in re.split(r"^FAIL$", said.out, flags=re.MULTILINE)[1].splitlines()[1]  # the first reason
+    assert "add poses" not in said.out  # the poses are not the fault
+    assert "lengths times" not in said.out
     assert run(*pairs.asked, "--setup", "eye-in-hand", "--inverse-poses", "-o", tmp_path / "rig.yaml").code == 0
     assert_found(tmp_path / "rig.yaml")
 
@@ -203,6 +210,18 @@ def test_files_out_of_step_and_a_wrong_board_size_are_told(run: Run, tmp_path: P
         assert told in said.out
 
 
+def test_poses_of_another_convention_are_told_by_their_places(run: Run, tmp_path: Path) -> None:
+    rng = np.random.default_rng(14)
+    first, second = in_hand(arm(rng), rng)
+    first[:, :3, 3] = first[:, [1, 2, 0], 3] * [1, -1, 1]  # as if the columns were others: the turns are as they were
+    said = run(*Pairs(tmp_path, first, second).asked, "--setup", "eye-in-hand")
+    assert said.code in (1, 3)
+    reasons = re.split(r"^FAIL$", said.out, flags=re.MULTILINE)[1].splitlines()
+    assert "the angles between poses agree and their places do not" in reasons[1]
+    assert "--pose-format" in reasons[1]
+    assert "add poses" not in said.out
+
+
 def test_one_axis_leaves_the_translation_along_it_open(run: Run, tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     t = np.linspace(-1, 1, 24)
@@ -251,6 +270,9 @@ def test_few_poses_are_told(run: Run, tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     first, second = in_hand(arm(rng), rng)
     assert "5 poses only" in run(*Pairs(tmp_path, first[:5], second[:5]).asked).out
+    three = run(*Pairs(tmp_path, first[:3], second[:3]).asked, "--setup", "eye-in-hand")
+    assert "3 poses only" in three.out
+    assert "3 of 3 poses used" in three.out  # none of three is thrown out: nobody contradicts it
     two = run(*Pairs(tmp_path, first[:2], second[:2]).asked, "--setup", "eye-in-hand")
     assert two.code == 3
     assert "arm.txt, board.txt: hand-eye needs two poses at least and has 1" in run(*Pairs(tmp_path, first[:1], second[:1]).asked).mistake

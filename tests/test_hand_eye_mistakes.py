@@ -9,6 +9,7 @@ from commands import Run
 from test_hand_eye import ONLY_X, SIGMA_P, SIGMA_R, noisy, poses, recorded, spread
 
 from calibkit.data.result import Thumbnail
+from calibkit.data.verdict import Verdict, worst
 from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye import calibrate_hand_eye
 from calibkit.estimation.hand_eye_data import of_recording
@@ -36,6 +37,7 @@ def test_the_sample_gives_its_truth_and_shows_its_worst_images(run: Run, tmp_pat
     assert "warning" not in said.err  # names that are no stamps, and the pose file among the images, are nothing to warn of
     assert "poses.csv: 20 poses found by file name" in said.out
     assert "if the camera is fixed beside the robot, the poses are the other way round: --setup eye-to-hand --inverse-poses" in said.out
+    assert run("handeye", *ASKED, "--poses", SAMPLE / "hand_eye/poses.csv", "--setup", "eye-in-hand", "--strict").code == 0
     truth = load_rig(SAMPLE / "truth_hand_eye.yaml")
     for name in ("T_gripper_cam0", "T_base_target"):
         entry = load_rig(rig).transforms[name]
@@ -103,7 +105,11 @@ def test_a_board_of_another_size_is_told_with_its_sigma_and_no_other() -> None:
         found = stretch(wrong.data, wrong.refined, wrong.trusted.inflation)
         assert found is not None
         assert abs(found.factor - 1 / 1.05) < min(4 * found.sigma, 0.01)
-        said = " ".join(reason.text for reason in judge_hand_eye("T_gripper_cam", wrong, (), Doubts(), "refined"))
+        reasons = judge_hand_eye("T_gripper_cam", wrong, (), Doubts(), "refined")
+        said = " ".join(reason.text for reason in reasons)
+        off = se3.local(wrong.X, fit.X)
+        assert np.linalg.norm(found.moves[:3] - off[:3]) < 0.3 * np.linalg.norm(off[:3]) + 1e-3
+        assert worst(reasons) is Verdict.FAIL  # it moves X by far more than its sigma
         assert f"the second side's lengths times {found.factor:.4f}" in said
 
 
@@ -115,11 +121,12 @@ def test_what_else_could_fit_is_told_with_the_choice() -> None:
     both = ("eye-in-hand", "eye-to-hand")
     choice = choose_setup(G, seen, None, both)
     assert choice.setup == "eye-in-hand"
-    assert choice.line.endswith("the poses are the other way round: --setup eye-to-hand --inverse-poses")
+    assert "the poses are the other way round: --setup eye-to-hand --inverse-poses; else confirm it" in choice.unconfirmed
+    assert choose_setup(G, seen, "eye-in-hand", both).unconfirmed == ""
     choice = choose_setup(se3.inverse(G), seen, None, both)
     assert choice.setup == "eye-to-hand"
-    assert "if the camera is on the gripper, the poses are the other way round: --setup eye-in-hand --inverse-poses" in choice.line
+    assert "if the camera is on the gripper, the poses are the other way round: --setup eye-in-hand --inverse-poses" in choice.unconfirmed
     fits = {setup: calibrate_hand_eye(of_recording(setup, G, seen), ONLY_X) for setup in both}
-    assert choose_fit(fits)[1].endswith("--setup eye-to-hand --inverse-poses")
+    assert "--setup eye-to-hand --inverse-poses" in choose_fit(fits).unconfirmed
     with pytest.raises(BadInputError, match="do not tell"):
         choose_fit({"eye-in-hand": fits["eye-in-hand"], "eye-to-hand": fits["eye-in-hand"]})

@@ -8,18 +8,16 @@ from calibkit.data.plural import counted
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_data import HandEyeData, Index
+from calibkit.estimation.hand_eye_lengths import CLEARLY
 from calibkit.estimation.hand_eye_pairs import motions, screw_mismatch
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 
-CLEARLY = 3.0  # times smaller: this fits and the other does not
 _NEAR = 5.0  # times what is left of the kept poses
 _TURNS = {90: "a quarter", 180: "half"}  # deg, that a board looks alike after
 _TURN_TOLERANCE = np.deg2rad(5.0)
 _NORMAL = 0.95  # cosine to the board's normal
 _FAST = 3.0  # times the middle speed
-_RESCALED = 0.005  # a length's error that is told
-_ROUNDS = 10
 _FLOOR = 1e-9
 _TOLD = 20  # wrong poses that are looked into
 _ASKED, _FEW = 300, 6  # poses whose angles are compared, and fewer that tell nothing
@@ -108,33 +106,6 @@ def _speeds(data: HandEyeData) -> Array | None:
     out = np.empty(len(order))
     out[order] = np.minimum(np.append(step, step[-1]), np.append(step[0], step))
     return out
-
-
-def length_ratio(fit: HandEyeFit) -> float | None:
-    """Return s where side 2's lengths times s fit far better than as they are: (R_A - I) t_X = s R_X t_B - t_A; None where they fit.
-
-    A board's wrong square, or millimetres taken for metres. Least absolute values, by reweighting.
-    """
-    data = fit.data
-    A, B = motions(data.P, fit.pairs), motions(data.Q, fit.pairs)
-    M, t_A, t_B = A[:, :3, :3] - np.eye(3), A[:, :3, 3], B[:, :3, 3] @ fit.X[:3, :3].T
-    if len(A) < 6 or np.abs(t_B).max() < _FLOOR:
-        return None
-    as_is, _ = _least_absolute(M, t_B - t_A)
-    free, x = _least_absolute(np.concatenate([M, -t_B[:, :, None]], axis=2), -t_A)
-    s = float(x[3])
-    told = s > 0 and abs(s - 1) > _RESCALED and as_is > CLEARLY * free + _FLOOR
-    return s if told else None
-
-
-def _least_absolute(M: Array, y: Array) -> tuple[float, Array]:
-    """Return the median residual and x of least sum |M_k x - y_k| for blocks M (k, 3, c) and y (k, 3)."""
-    root: Array = np.ones(len(M))
-    for _ in range(_ROUNDS):
-        x = np.linalg.lstsq((M * root[:, None, None]).reshape(-1, M.shape[2]), (y * root[:, None]).ravel(), rcond=1e-9)[0]
-        size = np.linalg.norm(M @ x - y, axis=1)
-        root = 1 / np.sqrt(np.maximum(size, 1e-3 * np.median(size) + 1e-12))
-    return float(np.median(size)), np.asarray(x, np.float64)
 
 
 def out_of_step(data: HandEyeData) -> int:

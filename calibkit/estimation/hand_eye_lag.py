@@ -32,6 +32,7 @@ class Stretch:
 
     factor: float
     sigma: float
+    moves: Array  # (6,) X's right tangent (m, rad): how far X is off where the lengths are
 
 
 @dataclass(frozen=True)
@@ -98,4 +99,4 @@ def stretch(data: HandEyeData, fit: Refined, inflation: float) -> Stretch | None
     column = eliminated(data, fit, g, fit.kept)
     sigma = float(np.sqrt(inflation / column.whole))
     told = max(_SIGMAS * sigma, _LEAST_STRETCH) < abs(column.dt) < _MOST_STRETCH
-    return Stretch(1 - column.dt, sigma) if told else None
+    return Stretch(1 - column.dt, sigma, column.dt * column.x) if told else None

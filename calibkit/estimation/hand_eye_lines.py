@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from calibkit.data.plural import plain
 from calibkit.data.transforms import carry_parameters
 from calibkit.data.verdict import Status
 from calibkit.errors import one_line
@@ -24,25 +25,23 @@ def lines(name: str, fixed: str, fit: HandEyeFit, asked: Asked, wrong: tuple[Sus
     how = "" if asked.method == REFINED else f", X by {asked.method} as asked for, its sigma by {DRAWS} draws of the noise"
     lines = [f"{name} ({fit.data.setup}): {kept} of {n} poses used{how}"]
     lines += [f"  {text}" for text in known_parts(name, fit)]
-    size = f"{np.degrees(fit.scatter.angle):.3g} deg, {1e3 * fit.scatter.distance:.3g} mm rms"
+    size = f"{plain(np.degrees(fit.scatter.angle), 3)} deg, {plain(1e3 * fit.scatter.distance, 3)} mm rms"
     each = "" if fit.n_worlds == 1 else f", each of {fit.n_worlds} stretches about its own"
     lines.append(f"  scatter of {fixed}, which should be one transform: {size}{each}")
     if asked.px is not None and fit.kept.any():
-        lines.append(f"  the board where the robot's poses say it is, in the images: rms {_rms(asked.px[fit.kept]):.3g} px")
+        lines.append(f"  the board where the robot's poses say it is, in the images: rms {plain(_rms(asked.px[fit.kept]), 3)} px")
     lines.append(f"  noise, {'assumed (too few poses tell it)' if fit.noise_assumed else 'told by the residuals'}: {_noise(fit)}")
-    lines += [
-        f"  left out: {one_line(s.label, 60)} ({np.degrees(s.angle):.3g} deg, {1e3 * s.distance:.3g} mm){': ' + s.why if s.why else ''}"
-        for s in wrong[:_WORST]
-    ]
+    for each_wrong in wrong[:_WORST]:
+        size = f"{plain(np.degrees(each_wrong.angle), 3)} deg, {plain(1e3 * each_wrong.distance, 3)} mm"
+        lines.append(f"  left out: {one_line(each_wrong.label, 60)} ({size}){': ' + each_wrong.why if each_wrong.why else ''}")
     if len(wrong) > _WORST:
         lines.append(f"  and {len(wrong) - _WORST} more (--json has them all)")
     lines.append(f"  worst pairs: {'; '.join(_worst_pairs(fit))}")
     if predicted is not None:
-        now, then = weakest_sigmas(fit.trusted.cov_X), weakest_sigmas(predicted)
-        lines.append(
-            f"  with {asked.predict} more good poses: p to {1e3 * then[0]:.2g} mm instead of {1e3 * now[0]:.2g}, "
-            f"R to {np.degrees(then[1]):.2g} deg instead of {np.degrees(now[1]):.2g} (weakest axis)"
-        )
+        carry = carry_parameters(fit.X)
+        then = np.sqrt(np.diag(carry @ predicted @ carry.T)) * np.repeat([1e3, np.degrees(1.0)], 3)
+        p, R = (", ".join(plain(x) for x in part) for part in (then[:3], then[3:]))
+        lines.append(f"  with {asked.predict} more good poses: p to ({p}) mm, R to ({R}) deg")
     return lines
 
 
@@ -74,7 +73,7 @@ def _known_axis(name: str, fit: HandEyeFit) -> str:
     u = about.vector * np.sign(about.vector[np.argmax(np.abs(about.vector))])
     there, here = ("({:.3f}, {:.3f}, {:.3f})".format(*(v.round(3) + 0.0)) for v in (u, fit.X[:3, :3] @ u))
     sigma = np.degrees(others[0].sigma * SCALES[3])
-    return f"R of {name}: {two}'s axis {there} is {one}'s axis {here} to {sigma:.2g} deg; how far it is turned about it is not known"
+    return f"R of {name}: {two}'s axis {there} is {one}'s axis {here} to {plain(sigma)} deg; how far it is turned about it is not known"
 
 
 def _known_directions(p: Array, cov: Array) -> list[str]:
@@ -85,7 +84,7 @@ def _known_directions(p: Array, cov: Array) -> list[str]:
     for u in axes if len(axes) == len(along) else along:
         u = u * np.sign(u[np.argmax(np.abs(u))])
         where = "xyz"[int(np.argmax(u))] if u.max() == 1 else "({:.2f}, {:.2f}, {:.2f})".format(*(u.round(2) + 0.0))
-        said.append(f"{1e3 * float(u @ p):+.2f} +- {1e3 * float(np.sqrt(u @ cov @ u)):.2g} mm along {where}")
+        said.append(f"{1e3 * float(u @ p):+.2f} +- {plain(1e3 * float(np.sqrt(u @ cov @ u)))} mm along {where}")
     return said
 
 
@@ -95,21 +94,22 @@ def _triple(values: Array, sigmas: Array) -> str:
     return "({}) +- ({})".format(*both)
 
 
-_NOISE = {  # by the kind of noise: words, and what its sigma is shown in
-    "rotation": ("turned by {:.2g} deg", float(np.degrees(1.0))),
-    "translation": ("placed by {:.2g} mm", 1e3),
-    "factor": ("off by {:.2g} times the sigmas that were told", 1.0),
-}
-
-
 def _noise(fit: HandEyeFit) -> str:
+    """Return each side's noise, of one coordinate: a told covariance as its corners' px where there are corners."""
     one, two, _, _ = fit.data.words.frames
     sides = {"P": one if fit.data.setup == "motion" else "the robot", "Q": two}
+    corners = fit.refined.corners
     said = []
     for key, value in fit.noise.items():
         side, kind = key.split("_")
-        words, unit = _NOISE[kind]
-        said.append(f"{sides[side]} {words.format(value * unit)}")
+        if kind == "rotation":
+            said.append(f"{sides[side]} turned by {plain(np.degrees(value))} deg")
+        elif kind == "translation":
+            said.append(f"{sides[side]} placed by {plain(1e3 * value)} mm")
+        elif side == "Q" and corners is not None:
+            said.append(f"{two}'s corners off by {plain(corners.rms(fit.refined.M)[0] / np.sqrt(2))} px")
+        else:
+            said.append(f"{sides[side]}'s poses off by {plain(value)} times the sigmas that they came with")
     return ", ".join(said) + " (a coordinate)"
 
 
@@ -129,8 +129,8 @@ def methods_table(fixed: str, fit: HandEyeFit) -> list[list[str]]:
 def _worst_pairs(fit: HandEyeFit) -> list[str]:
     """Return the pairs of kept poses that fit worst by the sum of their parts over the middle one's."""
     return [
-        f"{one_line(fit.data.labels[i], 60)} - {one_line(fit.data.labels[j], 60)} {np.degrees(fit.pair_angle[k]):.2g} deg "
-        f"{1e3 * fit.pair_distance[k]:.2g} mm"
+        f"{one_line(fit.data.labels[i], 60)} - {one_line(fit.data.labels[j], 60)} {plain(np.degrees(fit.pair_angle[k]))} deg "
+        f"{plain(1e3 * fit.pair_distance[k])} mm"
         for k in worst_pairs(fit, 3)
         for i, j in [fit.pairs[k]]
     ]

@@ -19,7 +19,7 @@ from calibkit.estimation.hand_eye_images import Corners, Sight
 from calibkit.estimation.hand_eye_lens import lens_step
 from calibkit.estimation.hand_eye_noise import RobotNoise
 from calibkit.estimation.hand_eye_normal import ENOUGH_FOR_NOISE, Normal, believed, normal
-from calibkit.estimation.hand_eye_robust import Seed
+from calibkit.estimation.hand_eye_robust import FEWEST_OTHERS, Seed
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
@@ -98,7 +98,7 @@ def refine(data: HandEyeData, start: Seed, corners: Corners | None = None, robot
         m = away + kept[:, None] * ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
         still = float(x @ system.S @ x) + lens_open < _SETTLED
         if number >= _STILL and (noise_settled or number >= _LONG) and still:
-            now = chi2 < wrong_beyond(freedom) if freedom else kept
+            now = chi2 < wrong_beyond(freedom) if freedom and len(kept) > FEWEST_OTHERS else kept
             converged = np.array_equal(now, kept) or reversals == _MAX_REVERSALS
             if converged and robot is None and not by_reach:
                 # Only of poses whose choice is settled: wrong ones contradict everything.

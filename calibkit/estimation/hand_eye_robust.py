@@ -17,6 +17,7 @@ _SCORED = 300  # motions
 _GOOD = 0.4  # of the motions are taken for right: what is left of them where 37 % of the poses are wrong
 _POSES = 60
 _ROUNDS = 3
+FEWEST_OTHERS = 3  # poses that can contradict one more: of fewer none is thrown out
 _OUTSIDE = 4.5  # sigmas; chance leaves out 1 in 6000
 _MEDIAN_3 = 1.538  # sigmas: the median length of a 3-vector of unit sigmas
 _FINEST = 1e-12
@@ -95,7 +96,8 @@ def inliers(data: HandEyeData, X: Array) -> tuple[Mask, float, float]:
     left = se3.local(Z[data.world] @ data.Q, data.P @ X)
     rho, phi = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
     sigma_rho, sigma_phi = (max(float(np.median(v)) / _MEDIAN_3, _FINEST) for v in (rho, phi))
-    return (rho < _OUTSIDE * sigma_rho) & (phi < _OUTSIDE * sigma_phi), sigma_phi, sigma_rho
+    fit = (rho < _OUTSIDE * sigma_rho) & (phi < _OUTSIDE * sigma_phi)
+    return fit | (len(fit) <= FEWEST_OTHERS), sigma_phi, sigma_rho
 
 
 def _draws(data: HandEyeData, rng: np.random.Generator) -> Index:

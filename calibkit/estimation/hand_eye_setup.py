@@ -9,14 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibkit.data.plural import counted, plain
 from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye, select
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.hand_eye_doubts import CLEARLY, misfit, strangers
+from calibkit.estimation.hand_eye_doubts import misfit, strangers
+from calibkit.estimation.hand_eye_lengths import CLEARLY
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
 _TRIED_ON = 200  # poses
+_FEW = 10  # poses, that more of are asked for
+_CHECK = "which pose belongs to which image, --pose-format, --angle-unit, and the board"
 # Whether P and Q are what was recorded or their inverses (hand_eye_world.SETUPS).
 SIGNS = {"eye-in-hand": (1, -1), "eye-to-hand": (-1, -1), "motion": (1, 1)}
 _WORDS = {
@@ -41,6 +45,7 @@ class Choice:
 
     setup: str
     line: str = ""
+    unconfirmed: str = ""  # what other poses it would be, where it was not asked for
     better: str = ""
     times: float = 1.0
 
@@ -51,9 +56,10 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
     BadInputError where none does clearly.
     """
     if strangers(first, second):
+        check = "that both are of one body and one recording" if tuple(candidates) == ("motion",) else _CHECK
         raise BadInputError(
             "the turns between poses of the two sides are no more alike than chance: they do not belong together, or one side is read "
-            "wrongly; check which pose belongs to which image, --pose-format, --angle-unit, and the board"
+            f"wrongly; check {check}"
         )
     left = {sign: _left(first, second, sign) for sign in (1, -1)}
     sign_of = {setup: SIGNS[setup][0] * SIGNS[setup][1] for setup in SIGNS}
@@ -64,32 +70,41 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
         if len(candidates) > 1 and times < CLEARLY:
             able = list(candidates)
         if len(able) > 1:
-            raise BadInputError(f"the poses do not tell {' from '.join(able)}: give --setup {' or '.join(able)}")
+            few = len(first) < _FEW
+            who, more = (f"{counted(len(first), 'pose')} do", "10 or more are needed; or ") if few else ("the poses do", "")
+            raise BadInputError(f"{who} not tell {' from '.join(able)}: {more}give --setup {' or '.join(able)}")
         asked = able[0]
         if len(candidates) > 1:
-            return Choice(asked, _chosen(asked, times, [setup for setup in candidates if setup != asked]))
+            others = [setup for setup in candidates if setup != asked]
+            return Choice(asked, _chosen(asked, times, others), _unconfirmed(asked, others))
     if sign_of[asked] != best and times > CLEARLY:
-        return Choice(asked, "", _OTHER[asked], times)
+        return Choice(asked, better=_OTHER[asked], times=times)
     return Choice(asked)
 
 
-def choose_fit(fits: Mapping[str, HandEyeFit]) -> tuple[str, str]:
-    """Return the setup whose own pairs leave far less, and how it was chosen; BadInputError where none does clearly."""
+def choose_fit(fits: Mapping[str, HandEyeFit]) -> Choice:
+    """Return the setup whose own pairs leave far less; BadInputError where none does clearly."""
     left = {setup: misfit(fit) for setup, fit in fits.items()}
     ranked = sorted(left, key=lambda setup: left[setup])
     if len(ranked) == 1:
-        return ranked[0], ""
+        return Choice(ranked[0])
     times = left[ranked[1]] / left[ranked[0]]
     if times < CLEARLY:
         raise BadInputError(f"the poses do not tell {' from '.join(ranked)}: give --setup {' or '.join(ranked)}")
-    return ranked[0], _chosen(ranked[0], times, ranked[1:2])
+    return Choice(ranked[0], _chosen(ranked[0], times, ranked[1:2]), _unconfirmed(ranked[0], ranked[1:2]))
 
 
 def _chosen(setup: str, times: float, others: Sequence[str]) -> str:
-    """Return how a setup was chosen; poses the other way round make the other one fit, so that is said, too."""
-    said = f"{_WORDS[setup]}: it fits {times:.3g} times better than {' or '.join(others)}"
+    return f"{_WORDS[setup]}: it fits {plain(times)} times better than {' or '.join(others)}"
+
+
+def _unconfirmed(setup: str, others: Sequence[str]) -> str:
+    """Return what a setup that was not asked for rests on: the poses the other way round make the other one fit as well."""
     other = next((other for other in others if other in _HINTS), "")
-    return f"{said}; {_HINTS[other]}, the poses are the other way round: --setup {other} --inverse-poses" if other else said
+    if not other:
+        return ""
+    text = f"taken as {setup}, for poses T_base_gripper; no data tell them from the other way round: {_HINTS[other]}, the poses"
+    return f"{text} are the other way round: --setup {other} --inverse-poses; else confirm it with --setup {setup}"
 
 
 def _left(first: Array, second: Array, sign: int) -> float:

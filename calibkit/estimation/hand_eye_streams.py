@@ -10,7 +10,7 @@ from calibkit.estimation import hand_eye
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
 from calibkit.estimation.hand_eye_lag import eliminated
 from calibkit.estimation.pose_interpolation import PoseStream
-from calibkit.estimation.pose_offset import Settings, aligned, milliseconds
+from calibkit.estimation.pose_offset import ClockOffset, Settings, aligned, milliseconds
 from calibkit.estimation.pose_pairing import Pairing, pair_poses
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
@@ -20,6 +20,7 @@ _SETTLED = 0.2  # sigmas
 _BLOCK_S = 2.0  # residuals farther apart are taken for independent
 _DISAGREE = 4.0  # sigmas
 _WORTH_S = 1e-3
+_FAST_AND_SLOW = "fast and slow motion disagree"  # time_offset_verdict's
 
 
 def calibrate_streams(
@@ -53,14 +54,22 @@ def calibrate_streams(
         follow = offset_left(pairing, fit)[2]
         more = both.offset.sigma**2 * np.outer(follow, follow)
         fit = replace(fit, cov_X=fit.cov_X + more, plain_cov_X=fit.plain_cov_X + more)
-    apart = abs(both.offset.dt - first.dt)
-    if apart > max(_DISAGREE * float(np.hypot(first.sigma, both.offset.sigma)), _WORTH_S):
-        text = (
-            f"dt_{P.name}_{Q.name}: whole poses have {milliseconds(both.offset.dt, both.offset.sigma)}, turns from one pose to the next "
-            f"{milliseconds(first.dt, first.sigma)}: stamps that jitter, or one of them smooths its poses; the former is used"
-        )
-        pairing = replace(pairing, reasons=(*pairing.reasons, Reason(Verdict.CHECK, text)))
-    return pairing, fit
+    return replace(pairing, reasons=_one_offset(P.name, Q.name, first, both.offset, pairing.reasons, 1.0 if both.read_P else -1.0)), fit
+
+
+def _one_offset(P: str, Q: str, turns: ClockOffset, whole: ClockOffset, reasons: tuple[Reason, ...], sign: float) -> tuple[Reason, ...]:
+    """Return the reasons with one that says which offset is used, where turns and whole poses, or fast and slow turns, have others."""
+    fast = turns.fit.by_fast_turns if turns.fit is not None and whole.known == "poses" else None
+    apart = abs(whole.dt - turns.dt) > max(_DISAGREE * float(np.hypot(turns.sigma, whole.sigma)), _WORTH_S)
+    if fast is None and not apart:
+        return reasons
+    others = [milliseconds(turns.dt, turns.sigma) + (" by turns of some tenths of a second" if fast else " by turns from pose to pose")]
+    others += [milliseconds(sign * fast[0], fast[1]) + " from stamp to stamp"] if fast else []
+    text = (
+        f"dt_{P}_{Q}: use {milliseconds(whole.dt, whole.sigma)}, which whole poses have, places too; turns alone have "
+        f"{' and '.join(others)}: a filter, blur or stamps that jitter in {P} or {Q}"
+    )
+    return (*(reason for reason in reasons if fast is None or _FAST_AND_SLOW not in reason.text), Reason(Verdict.CHECK, text))
 
 
 def offset_left(pairing: Pairing, fit: HandEyeFit) -> tuple[float, float, Array]:

@@ -2,19 +2,23 @@
 
 from dataclasses import dataclass
 
-from calibkit.data.plural import counted
+import numpy as np
+
+from calibkit.data.plural import counted, plain
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_doubts import Suspect
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.hand_eye_lag import stretch
+from calibkit.estimation.hand_eye_lengths import places_disagree, unit_of
 from calibkit.estimation.hand_eye_open import Open
 
 GOOD_POSES = 10
 _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
 _FEW_ENOUGH = 200  # poses, to name those that are wrong
 _NAMED = 4
+_OFF, _OFF_SIGMAS = 3e-3, 10.0  # m or sigmas that lengths of another scale may move p by, with a CHECK
 _ANCHORS = ("park", "horaud", "daniilidis")  # that fail together only where something is wrong
 
 
@@ -26,58 +30,74 @@ class Doubts:
     times: float = 1.0  # by how much
     length_ratio: float | None = None
     step: str = ""  # the files are out of step, in words
+    unconfirmed: str = ""  # the setup was taken by what fits, which other poses the other way round would, too
 
 
 def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubts: Doubts, method: str) -> tuple[Reason, ...]:
-    """Return the reasons about `name` = T_1_2, PASS where there is nothing to say."""
-    found = (*_doubtful(fit, doubts), *_open(fit), *_poses(fit, wrong), *_about(fit))
+    """Return the reasons about `name` = T_1_2, PASS where there is nothing to say; what explains the others comes first."""
+    cause = _cause(fit, doubts)
+    found = (*cause, *([] if cause else _scale(fit)), *_open(fit, not cause), *_poses(fit, wrong), *_about(fit))
     reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in found]
     chosen = fit.methods.get(method)
     if chosen is not None and chosen.failed:
         reasons.append(Reason(Verdict.FAIL, f"{name}: {method}, which was asked for, is far from the refined X: take --method refined"))
+    if doubts.unconfirmed:
+        reasons.append(Reason(Verdict.CHECK, f"{name}: {doubts.unconfirmed}"))
     return tuple(reasons)
 
 
-def _open(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
-    advice = "; ".join(dict.fromkeys(a.text for a in fit.advice))
+def _cause(fit: HandEyeFit, doubts: Doubts) -> list[tuple[Verdict, str]]:
+    """Return what is wrong with all poses alike: then no more of them would help, and no other guess is worth telling."""
+    s, motion = doubts.length_ratio, fit.data.setup == "motion"
+    if doubts.better:
+        return [(Verdict.FAIL, f"{doubts.better} fits {plain(doubts.times)} times better")]
+    if doubts.step:
+        return [(Verdict.FAIL, doubts.step)]
+    if s is not None:
+        why = "the units of both sides" if motion else unit_of(s) or "the size of the board and the units of the poses"
+        check = "" if unit_of(s) and not motion else "check "
+        return [(Verdict.FAIL, f"{_second(fit)}'s lengths times {s:.4g} fit far better: {check}{why}")]
+    if places_disagree(fit) and not _scale(fit):
+        text = "the angles between poses agree and their places do not: places or angles are read wrongly"
+        names = "units and the quaternions' order of both sides" if motion else "--pose-format, --pose-unit and the quaternions' order"
+        return [(Verdict.FAIL, f"{text}; check {names}")]
+    return []
+
+
+def _scale(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
+    """Return lengths that fit better by little; FAIL where X is off by more than its sigma, which holds no error of scale, can tell."""
+    found = stretch(fit.data, fit.refined, fit.trusted.inflation)
+    if found is None:
+        return []
+    p = found.moves[:3]
+    far = float(np.linalg.norm(p))
+    sigma = float(np.sqrt(p @ fit.cov_X[:3, :3] @ p)) / max(far, 1e-12)
+    text = f"{_second(fit)}'s lengths times {found.factor:.4f} +- {plain(found.sigma)} fit better, and move p by {plain(1e3 * far)} mm"
+    check = "the units of both, and the scale of an odometry" if fit.data.setup == "motion" else ""
+    check = check or "the board's squares (measure them), the target file and the units of the poses"
+    return [(Verdict.FAIL if far > min(_OFF, _OFF_SIGMAS * sigma) else Verdict.CHECK, f"{text}: check {check}")]
+
+
+def _second(fit: HandEyeFit) -> str:
+    return fit.data.words.frames[1] if fit.data.setup == "motion" else "the second side"
+
+
+def _open(fit: HandEyeFit, advise: bool) -> list[tuple[Verdict, str]]:
+    """Return what is not observable, and what is weak where that is not the same; the poses to add once."""
+    advice = "; ".join(dict.fromkeys(a.text for a in fit.advice)) if advise else ""
     hidden = [key for key, status in parameter_statuses(fit.X, fit.cov_X).items() if status is Status.NOT_OBSERVABLE]
+    those = [o.text for o in fit.open if o.grade == "not observable"]
+    weak = [f"{o.text}, known to {plain(o.sigma)} {_unit(o)} only" for o in fit.open if o.grade == "weak" and o.text not in those]
     out = []
-    for grade, verdict in (("not observable", Verdict.FAIL), ("weak", Verdict.CHECK)):
-        those = [f"{o.text}, known to {o.sigma:.2g} {_unit(o)} only" if grade == "weak" else o.text for o in fit.open if o.grade == grade]
-        if those:
-            named = f" ({', '.join(hidden)})" if grade == "not observable" else ""
-            out.append((verdict, f"{grade}: {'; '.join(those)}{named}" + (f": {advice}" if advice else "")))
+    if those:
+        out.append((Verdict.FAIL, f"not observable: {'; '.join(those)} ({', '.join(hidden)})" + (f": {advice}" if advice else "")))
+    if weak and advise:
+        out.append((Verdict.CHECK, f"weak: {'; '.join(weak)}" + (f": {advice}" if advice and not those else "")))
     return out
 
 
 def _unit(o: Open) -> str:
     return "mm" if o.text.startswith("p ") else "mrad"
-
-
-def _doubtful(fit: HandEyeFit, doubts: Doubts) -> list[tuple[Verdict, str]]:
-    out = []
-    if doubts.better:
-        out.append((Verdict.FAIL, f"{doubts.better} fits {doubts.times:.3g} times better"))
-    if doubts.step:
-        out.append((Verdict.FAIL, doubts.step))
-    s = doubts.length_ratio
-    by_little = stretch(fit.data, fit.refined, fit.trusted.inflation) if s is None and not out else None
-    if by_little is not None:
-        text = f"the second side's lengths times {by_little.factor:.4f} +- {by_little.sigma:.2g} fit better"
-        out.append((Verdict.CHECK, f"{text}: measure the board's squares, and check the target file and the units of the poses"))
-    if s is not None:
-        unit = next((f": {text}" for factor, text in _UNITS if abs(s / factor - 1) < 0.05), "")
-        text = f"the second side's lengths times {s:.4g} fit far better{unit or ': check the size of the board and the units of the poses'}"
-        out.append((Verdict.FAIL, text))
-    return out
-
-
-_UNITS = (
-    (1000.0, "the first side's poses are in mm, or the board's size is 1000 times too small: check --pose-unit and the target file"),
-    (0.001, "the board's size is in mm, or the first side's poses are 1000 times too small: check the target file and --pose-unit"),
-    (100.0, "the first side's poses are in cm: check --pose-unit"),
-    (0.01, "the board's size is in cm: check the target file"),
-)
 
 
 def _poses(fit: HandEyeFit, wrong: tuple[Suspect, ...]) -> list[tuple[Verdict, str]]:

@@ -71,8 +71,12 @@ def pair_poses(both: Streams, settings: Settings) -> Pairing:
     names, slow, fast = f"{both.P.name} and {both.Q.name}", both.slow, both.fast
     on_fast = both.offset.on_fast(slow.t_ns, both.read_P)
     if on_fast[-1] < fast.t_ns[0] or on_fast[0] > fast.t_ns[-1]:
+        if both.offset.known == "assumed":
+            reason = "".join(f" ({line.rpartition(': ')[2]})" for line in both.lines[:1])
+            text = f"{names} share no time by their stamps, and turn alike at no other offset of their clocks{reason}"
+            raise BadInputError(f"{text}: they do not belong to one body, or to one recording of it")
         apart = f"{names} share no time at dt = {both.offset.dt:.6g} s"
-        raise BadInputError(f"{apart}: give the offset of their clocks, or leave it out to have it estimated")
+        raise BadInputError(f"{apart}, the offset of their clocks as it was given: correct it, or leave it out to have it estimated")
     moving = _moving(both, on_fast, settings)
     still = _at_rest(both, on_fast) if settings.rests is not False else None
     chosen, why = _choose(moving, still, settings, names)

@@ -141,6 +141,8 @@ def cross_sections(figure: Figure, view: View) -> None:
         panel.axhline(0, color="black", lw=0.3)
         panel.axvline(0, color="black", lw=0.3)
     axes[0].plot([], [], ".", color=PALE, ms=8, label="one pose alone")
+    if not view.kept.all():
+        axes[0].plot([], [], "x", color=ACCENT, ms=5, label="left out")
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, frameon=False, ncols=min(len(names), 9), loc="outside lower center", fontsize=8)
     p = 1e3 * hand_eye.X[:3, 3]

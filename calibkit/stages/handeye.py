@@ -13,7 +13,8 @@ from calibkit.errors import BadInputError, NotConvergedError, one_line
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye
 from calibkit.estimation.hand_eye_asked import REFINED, Asked
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
-from calibkit.estimation.hand_eye_doubts import length_ratio, out_of_step, told_step
+from calibkit.estimation.hand_eye_doubts import out_of_step, told_step
+from calibkit.estimation.hand_eye_lengths import length_ratio
 from calibkit.estimation.hand_eye_methods import METHODS
 from calibkit.estimation.hand_eye_pixels import corner_rms
 from calibkit.estimation.hand_eye_redrawn import by_closed_form
@@ -50,7 +51,8 @@ def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: O
     except BadInputError as error:
         raise BadInputError(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
     step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
-    doubts = Doubts(choice.better, choice.times, length_ratio(fit), told_step(step) if step else "")
+    told = told_step(step) if step else ""
+    doubts = Doubts(choice.better, choice.times, length_ratio(fit), told, choice.unconfirmed or sides.unconfirmed)
     asked = Asked(
         options.method,
         options.predict,

@@ -70,7 +70,7 @@ def how(fit: HandEyeFit) -> list[str]:
         lens = "free" if found.free else "held, its covariance in X's" if fit.lens else "held"
         lines.append(f"refined in the images: {used} of {seen} corners, rms {rms:.3g} px, the lens {lens}")
     if fit.by_reach:
-        lines.append("the robot's places and turns contradict each other (its errors depend on its pose): places count for less")
+        lines.append("the robot errs more in places than in turns, by its reach: its places count for less (docs: places by reach)")
     return lines
 
 

@@ -82,6 +82,7 @@ class Sides:
     fit: HandEyeFit | None = None  # of streams: they are paired and fitted at once
     offsets: dict[str, TimeOffset] = field(default_factory=dict)  # of their clocks, for the rig
     reasons: tuple[Reason, ...] = ()  # about these
+    unconfirmed: str = ""  # what else the setup of `fit` may be
 
     def words(self, setup: str) -> tuple[str, str, str, str]:
         """Return the frames 1, 2, w1, w2 of a setup."""

@@ -45,8 +45,11 @@ def two_streams(recording: Recording, rig: Rig, options: Options, progress: Prog
     first = inverted(first) if options.inverse_poses else first
     second = inverted(second) if options.inverse_second else second
     frames = (*names, f"{names[0]}world", f"{names[1]}world")
-    found = _calibrate(first, second, "motion", (frames[0], frames[1], frames[2], frames[3]), rig, progress)
     told = [f"{name} is {one_line(text.rpartition('=')[2], 100)}" for name, text in zip(names, asked, strict=True)]
+    try:
+        found = _calibrate(first, second, "motion", (frames[0], frames[1], frames[2], frames[3]), rig, progress)
+    except BadInputError as error:
+        raise BadInputError(f"{', '.join(told)}: {error}") from None
     sides = _sides(found, (first.name, second.name), (frames[0], frames[1], frames[2], frames[3]), ("motion",))
     return replace(sides, lines=(", ".join(told), *sides.lines), warnings=tuple(recording.warnings), inputs=tuple(recording.inputs()))
 
@@ -106,7 +109,8 @@ def beside_board(
             failed.append(error)
     if not found:
         raise failed[0]
-    setup, line = choose_fit({key: fit for key, (_, fit) in found.items()})
+    choice = choose_fit({key: fit for key, (_, fit) in found.items()})
+    setup, line = choice.setup, choice.line
     sides = _sides(found[setup], (stream.name, seen.name), frames, ROBOT)
     order = np.argsort(board.poses.t_ns, kind="stable")
     rows = order[np.searchsorted(board.poses.t_ns[order], found[setup][0].t_Q_ns)]
@@ -116,6 +120,7 @@ def beside_board(
         lines=(*sides.lines, *([line] if line else []), *notes),
         warnings=(*recording.warnings, *board.views.warnings),
         inputs=tuple(inputs),
+        unconfirmed=choice.unconfirmed,
     )
 
 

@@ -1,5 +1,6 @@
 """What two sensors disagree in although their turns fit, and noise that is not the same throughout."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,12 @@ from time_offset_samples import (
     Sample,
     alarms,
     any_offset,
+    board_sample,
+    camera_session,
     path,
     pose_imu,
     seen_gyro,
+    seen_poses,
     stamps,
     told,
     wheels_imu,
@@ -23,6 +27,7 @@ from time_offset_samples import (
 from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.verdict import Status, Verdict
 from calibkit.errors import BadInputError
+from calibkit.estimation.alignment import open_axes
 from calibkit.estimation.slow_turns import joined_up, turns_in_long_one
 from calibkit.estimation.turns import Turns, turns_of_poses
 from calibkit.geometry import so3
@@ -65,7 +70,22 @@ def test_degrees_taken_for_radians_are_named() -> None:
         told(scaled(sample, np.degrees(1)))
     _, said = told(scaled(sample, np.radians(1)))
     assert said.status is Status.NOT_OBSERVABLE
-    assert any("--gyro-unit" in reason.text for reason in said.reasons)
+    assert re.search("not observable: cam0 turns .* times as far as imu0: degrees taken for radians", said.reasons[0].text)
+
+
+@pytest.mark.parametrize("motion", ["planar", "single-axis"])
+@pytest.mark.parametrize("seed", range(2))
+def test_turns_about_one_axis_tell_the_offset_and_leave_the_rotation_open(motion: str, seed: int) -> None:
+    sample = board_sample(camera_session(seed, 0.005, motion=motion, duration_s=20.0))
+    fit, said = told(sample)
+    assert alarms(said) == []
+    assert abs(fit.td - sample.td) < 4 * fit.sigma < 5e-4
+    axes = open_axes(fit.alignment)
+    assert len(axes) == 1
+    part = fit.alignment.parts[0].stretch.turns
+    np.testing.assert_allclose(np.abs(np.linalg.svd(part.angle)[2][0] @ axes[0]), 1, atol=1e-2)
+    rich = board_sample(camera_session(seed, 0.005, duration_s=10.0))
+    assert len(open_axes(told(rich)[0].alignment)) == 0
 
 
 def test_a_swing_is_not_known_and_both_offsets_are_named() -> None:
@@ -116,7 +136,7 @@ def test_shaking_by_itself_is_nothing_wrong(seed: int) -> None:
 def test_long_turns_are_short_ones_after_each_other() -> None:
     turns = shaken(0, 0.0).turns
     turns = turns.select(np.arange(len(turns.first)) != 100)  # a run of 100, and the rest
-    many = turns_in_long_one(turns)
+    many = turns_in_long_one([turns])
     assert many == 6
     for phase in (0, 2):
         long = joined_up(turns, many, phase)
@@ -131,8 +151,8 @@ def test_long_turns_are_short_ones_after_each_other() -> None:
 
 def test_turns_that_are_long_already_are_left() -> None:
     t_ns = 500_000_000 * np.arange(21)
-    assert turns_in_long_one(Turns(t_ns, np.arange(20), np.arange(1, 21), np.full((20, 3), 0.1))) < 2
-    assert turns_in_long_one(Turns(t_ns // 50, np.arange(20), np.arange(1, 21), np.full((20, 3), 0.5))) < 2  # 87 rad/s
+    assert turns_in_long_one([Turns(t_ns, np.arange(20), np.arange(1, 21), np.full((20, 3), 0.1))]) < 2
+    assert turns_in_long_one([Turns(t_ns // 50, np.arange(20), np.arange(1, 21), np.full((20, 3), 0.5))]) < 2  # 87 rad/s
 
 
 # Poses that are more exact at rest than in motion
@@ -179,3 +199,43 @@ def test_poses_that_are_five_times_more_exact_at_rest_leave_sigma_honest(rest: f
     low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], seeds) / seeds)
     print(f"{rest} s at rest, {lively} s of motion: error over sigma {np.sqrt(np.mean(np.square(z))):.2f} of {low:.2f}-{high:.2f}")
     assert low < np.sqrt(np.mean(np.square(z))) < high
+
+
+def test_wrong_poses_do_not_change_what_a_long_turn_is() -> None:
+    """A hundredth of the poses is wrong by a lot: turns of 0.3 s are still made of six, by what is kept."""
+    sample = shaken(1, 0.02)
+    rng = np.random.default_rng(0)
+    angle = sample.turns.angle.copy()
+    rows = rng.choice(len(angle), len(angle) // 50, replace=False)
+    angle[rows] = rng.uniform(-1.5, 1.5, (len(rows), 3))
+    fit, said = told(replace(sample, turns=replace(sample.turns, angle=angle)))
+    assert fit.by_fast_turns is not None
+    assert np.median(fit.alignment.parts[0].stretch.turns.duration) == pytest.approx(0.273, abs=0.001)
+    assert any("fast and slow motion disagree" in reason.text for reason in said.reasons)
+
+
+def test_a_jump_is_paid_for_by_sigma_and_interval() -> None:
+    sample = board_sample(camera_session(0, 0.005, faults=("image-step",), duration_s=40.0))
+    fit, _ = told(sample)
+    assert fit.clock is not None
+    assert len(fit.clock.jumps) == 1
+    without = replace(fit, clock=None)
+    assert fit.sigma == max(without.sigma, fit.clock.sigma_s)
+    low, high = fit.interval
+    assert 3 * fit.sigma < high - low < 5 * fit.sigma
+
+
+def test_noise_of_the_reference_is_named_as_such() -> None:
+    truth, rng = path(0), np.random.default_rng(0)
+    reference = seen_poses(truth, stamps(100, 30), 0.01, rng)
+    of = seen_poses(truth, stamps(20, 28, 1.0123), 1e-3, rng, R_OF_TO.T, 0.02)
+    _, said = told(Sample(turns_of_poses(of), of.t_ns, reference, 0.02))
+    assert said.status is Status.NOT_OBSERVABLE
+    assert "is the noise of imu0's rates" in said.reasons[0].text
+
+
+def test_a_reference_that_comes_rarely_is_doubted() -> None:
+    truth, rng = path(0), np.random.default_rng(0)
+    reference = seen_poses(truth, stamps(10, 60), 1e-4, rng)
+    of = seen_poses(truth, stamps(20, 55, 1.0123), 1e-4, rng, R_OF_TO.T, 0.02)
+    assert any("comes at 10 Hz only" in text for text in alarms(told(Sample(turns_of_poses(of), of.t_ns, reference, 0.02))[1]))

@@ -31,11 +31,14 @@ _OUTLIER = 8.0  # chi-squared a degree of freedom: beyond chance in 100 000 turn
 _MEDIAN = {1: 0.455, 2: 1.386, 3: 2.366}  # of chi-squared
 _STEPS = 15
 _CLOSE = 1e-6  # chi-squared that a step still gains
+_SETTLED = 0.03  # sigmas of tau: the rotation that turns about one axis leave open may creep on
 _PRIOR = np.array([TILT**-2, TILT**-2, TILT**-2, 0.0])
 _LONGEST_STEP_S = 0.05
 _WINDOW_STEP_S = 0.002
 _WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
 _FURTHEST_S = 0.8  # that a stretch's own bottom is looked for
+_OPEN = 1e-4  # of the best axis' information: a hundredth of the turns, which noise and a lens' errors are worth
+_KNOWN = 0.03  # rad
 _DRAWS = 8
 _SLAB = 2_000_000  # numbers held at once
 
@@ -141,19 +144,34 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
 
 def newton(a: Alignment) -> Alignment:
     """Return the alignment at the bottom near it, by Gauss-Newton."""
-    free = np.arange(0 if a.free_rotation else 3, 4)
+    settled = False
     for _ in range(_STEPS):
         H = _gram(columns(a))
-        A = (H[:4, :4] + np.diag(_PRIOR))[np.ix_(free, free)]
-        scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
-        step = np.zeros(4)
-        step[free] = scale * np.linalg.lstsq(A * scale[:, None] * scale, H[free, 4] * scale, rcond=1e-13)[0]
+        step, sigma = _step(a, H)
         far = abs(step[3]) / _LONGEST_STEP_S
         step /= max(1.0, far)
         a = replace(a, R=moved(a.R, step[:3]), tau=a.tau + float(step[3]))
-        if step @ (H[:4, :4] @ step) < _CLOSE and far < 1:
-            return replace(a, converged=True)
-    return replace(a, converged=False)
+        settled = far < 1 and abs(step[3]) < _SETTLED * sigma
+        if far < 1 and step @ (H[:4, :4] @ step) < _CLOSE:
+            break
+    return replace(a, converged=bool(settled))
+
+
+def _step(a: Alignment, H: Array) -> tuple[Array, float]:
+    """Return Gauss-Newton's step of rotation and tau (4,) for the columns' Gram matrix, and tau's sigma."""
+    free = np.arange(0 if a.free_rotation else 3, 4)
+    A = (H[:4, :4] + np.diag(_PRIOR))[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    inverse = np.linalg.pinv(A * scale[:, None] * scale, rcond=1e-13, hermitian=True)
+    step = np.zeros(4)
+    step[free] = scale * (inverse @ (H[free, 4] * scale))
+    return step, float(scale[-1] * np.sqrt(inverse[-1, -1]))
+
+
+def stepped(a: Alignment, parts: Sequence[Array]) -> tuple[float, list[Array]]:
+    """Return by how much tau moves in one step of Gauss-Newton, and the columns of every part with the residuals that it leaves."""
+    step = _step(a, _gram(parts))[0]
+    return float(step[3]), [np.column_stack([X[:, :4], X[:, 4] - X[:, :4] @ step]) for X in parts]
 
 
 def columns(a: Alignment) -> list[Array]:
@@ -163,6 +181,15 @@ def columns(a: Alignment) -> list[Array]:
 
 def _gram(parts: Sequence[Array]) -> Array:
     return np.asarray(sum((X.T @ X for X in parts), np.zeros((5, 5))), np.float64)
+
+
+def open_axes(a: Alignment) -> Array:
+    """Return the axes (k, 3) in the frame of the turns about which they hardly tell the rotation: all turning is about another one."""
+    if not a.free_rotation or len(a.R) != 3:
+        return np.zeros((0, 3))
+    values, vectors = np.linalg.eigh(_gram(columns(a))[:3, :3])
+    axes = vectors[:, (values < _OPEN * values[-1]) | (values < _KNOWN**-2)].T
+    return np.asarray(axes * np.sign(axes[np.arange(len(axes)), np.argmax(np.abs(axes), axis=1)])[:, None], np.float64)
 
 
 def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:

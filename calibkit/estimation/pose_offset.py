@@ -1,5 +1,6 @@
 """How far the clocks of two pose streams are apart: as given, by how both turn, or none where they share one clock."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 MOST_PAIRS = 1000
+_COARSE_S = 0.02  # an offset that turns tell so well is a start: whole poses tell it better
 
 
 @dataclass(frozen=True)
@@ -123,9 +125,13 @@ def offset_by_turns(
         why = str(error)
     else:
         judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns) for each in (P, Q)})
-        if judged.status is not Status.NOT_OBSERVABLE:
+        if judged.status is not Status.NOT_OBSERVABLE or (judged.coarse and fit.sigma < _COARSE_S):
             offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit)
-            return offset, [], tuple(reason for reason in judged.reasons if f"{name}: weak:" not in reason.text)
+            return (
+                offset,
+                [],
+                tuple(reason for reason in judged.reasons if not re.match(f"{re.escape(name)}: (weak|not observable):", reason.text)),
+            )
         why, reasons = judged.reasons[0].text.removeprefix(f"{name}: not observable: "), judged.reasons[1:]
     if not one_clock:
         raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}; or give {name} in a rig file")

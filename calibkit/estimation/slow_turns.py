@@ -5,11 +5,12 @@ fastest motion is told wrong (a motion capture's filter, blur, vibration). Hausm
 variance sigma_long^2 - sigma_short^2.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibkit.estimation.alignment import Alignment, newton, weighed
+from calibkit.estimation.alignment import Alignment, weighed
 from calibkit.estimation.turn_comparison import LEAST_TURNS, split
 from calibkit.estimation.turns import Turns
 from calibkit.geometry import so3
@@ -19,11 +20,14 @@ _MOST_ANGLE = 1.5  # rad; turns near pi have no one rotation vector
 _PHASES = 6  # starts of long turns; they overlap, and their scores' correlation is paid for
 
 
-def turns_in_long_one(turns: Turns) -> int:
+def turns_in_long_one(parts: Sequence[Turns]) -> int:
     """Return over how many turns a long one goes; below 2 where they are long already."""
-    rate = np.linalg.norm(turns.angle, axis=1) / turns.duration
-    fast = float(np.percentile(rate, 99.5))
-    return int(min(LONG_S, _MOST_ANGLE / max(fast, 1e-9)) / float(np.median(turns.duration)))
+    duration = np.concatenate([turns.duration for turns in parts])
+    angle = np.concatenate([np.linalg.norm(turns.angle, axis=1) for turns in parts])
+    if not len(angle):
+        return 0
+    fast = float(np.percentile(angle / duration, 99.5))
+    return int(min(LONG_S, _MOST_ANGLE / max(fast, 1e-9)) / float(np.median(duration)))
 
 
 def joined_up(turns: Turns, many: int, phase: int = 0) -> Turns:
@@ -40,10 +44,18 @@ def joined_up(turns: Turns, many: int, phase: int = 0) -> Turns:
     return Turns(turns.t_ns, turns.first[head], turns.last[head + many - 1], so3.quat_log(turned), turns.end_cov, own, turns.axes)
 
 
-def by_slow_turns(a: Alignment) -> Alignment | None:
-    """Return the alignment of long turns (overlapping, of several starts) of what is kept; None where they are too few."""
+@dataclass(frozen=True)
+class Slow:
+    """Long turns laid beside the track at the offset of the short ones."""
+
+    alignment: Alignment
+    many: int  # turns in a long one
+
+
+def by_slow_turns(a: Alignment) -> Slow | None:
+    """Return the long turns (overlapping, of several starts) of what is kept, weighed as the short ones; None where they are too few."""
     kept = [stretch.turns.select(keep) for stretch, keep in zip(a.stretches, a.keep, strict=True) if keep.any()]
-    many = min((turns_in_long_one(turns) for turns in kept), default=0)
+    many = turns_in_long_one(kept)
     if many < 2:
         return None
     stretches = []
@@ -54,5 +66,5 @@ def by_slow_turns(a: Alignment) -> Alignment | None:
                 stretches += split(long, a.track.origin_ns, a.stretches[0].free_bias)
     if not stretches:
         return None
-    slow = replace(a, stretches=tuple(stretches), keep=tuple(np.ones(len(each.turns.first), bool) for each in stretches))
-    return newton(weighed(slow))
+    keep = tuple(np.ones(len(each.turns.first), bool) for each in stretches)
+    return Slow(weighed(replace(a, stretches=tuple(stretches), keep=keep)), many)

@@ -19,6 +19,7 @@ from calibkit.estimation.alignment import (
     newton,
     noise_information,
     settle,
+    stepped,
     sweep,
     turned_alike,
     window_offsets,
@@ -41,7 +42,7 @@ _BIAS = 2e-3  # rad/s; a gyroscope's larger bias is taken out of its track, whos
 _FEWEST = 20  # turns
 _CHI2_95 = 3.841
 _RIVAL = 10.83  # chi-squared of 1 in 1000: a bottom that is no more than this higher may be the true one
-_RIVAL_SHARE = 0.3  # of the stretches must be known at both lags
+_RIVAL_SHARE = 0.5  # of the stretches must be known at both lags
 _AS_LOW = 4.0  # chi-squared; the grid's own step is no reason to look again
 _AGAIN = 2
 _APART_S = 0.02  # what two starts lead to within is one bottom
@@ -94,8 +95,9 @@ class TimeOffsetFit:
 
     @property
     def sigma(self) -> float:
-        """Return one standard deviation, correlated residuals and noise in the reference's rates paid for."""
-        return float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, _LEAST_SHARE)))
+        """Return one standard deviation, correlated residuals, noise in the reference's rates and a clock's jumps paid for."""
+        of_tau = float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, _LEAST_SHARE)))
+        return max(of_tau, self.clock.sigma_s) if self.clock is not None and self.clock.jumps else of_tau
 
     @property
     def depth(self) -> float:
@@ -116,18 +118,19 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
     BadInputError where the two share too little time. What the fit is worth is for `time_offset_verdict` to say.
     """
     fit = _fit(turns, reference, settings, progress)
-    slow = by_slow_turns(fit.alignment) if settings.levels is None else None
-    if slow is None or not _contradicts(fit, slow):
+    moves = fit.clock is not None and fit.clock.kind != "constant"
+    slow = by_slow_turns(fit.alignment) if settings.levels is None and not moves else None
+    if slow is None or not _contradicts(fit, slow.alignment):
         return fit
-    long = joined_up(turns, turns_in_long_one(turns))
-    return replace(_fit(long, reference, settings, progress), by_fast_turns=(fit.td, fit.sigma))
+    long = _fit(joined_up(turns, slow.many), reference, settings, progress)
+    return replace(long, by_fast_turns=(fit.td, fit.sigma)) if abs(long.td - fit.td) > SCALES["s"] else fit
 
 
 def _contradicts(fit: TimeOffsetFit, slow: Alignment) -> bool:
     """Whether long turns tell another offset, by Hausman's test with half their variance at least: chance may bring it below."""
-    variance = float(_covariance(slow, columns(slow)).corrected[0, 0])
-    apart = (slow.tau - fit.alignment.tau) ** 2 / max(variance - fit.sigma**2, variance / 2)
-    return apart > _CONTRADICTED and abs(slow.tau - fit.alignment.tau) > SCALES["s"]
+    apart, parts = stepped(slow, columns(slow))
+    variance = float(_covariance(slow, parts).corrected[0, 0])
+    return apart**2 > _CONTRADICTED * max(variance - fit.sigma**2, variance / 2) and abs(apart) > SCALES["s"]
 
 
 def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress) -> TimeOffsetFit:
@@ -179,12 +182,13 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
         noise_share=noise_share,
         lost=lost_to_gaps(replace(turns, t_ns=turns.t_ns + start.coarse_ns), a.track, -reach - _MARGIN_S, reach + _MARGIN_S),
     )
-    return replace(fit, second=_second(fit, starts[1:]))
+    return replace(fit, second=_second(fit, starts[1:]), interval=_with_jumps(fit))
 
 
 def _refuse_other_unit(turns: Turns, track: OrientationTrack) -> None:
     """Refuse streams of which one turns as much faster as degrees are more than radians."""
-    own = float(np.percentile(np.linalg.norm(turns.angle, axis=1) / turns.duration, 90)) if len(turns.first) else 0.0
+    long = joined_up(turns, max(1, turns_in_long_one([turns])))  # less noisy
+    own = float(np.percentile(np.linalg.norm(long.angle, axis=1) / long.duration, 90)) if len(long.first) else 0.0
     other = float(np.percentile(np.linalg.norm(track.rate[track.chain >= 0], axis=1), 90)) if np.any(track.chain >= 0) else 0.0
     if min(own, other) > _TURNING and abs(np.log(max(own, other) / min(own, other) * np.pi / 180)) < _OTHER_UNIT:
         which = ("first", "second") if own > other else ("second", "first")
@@ -291,6 +295,16 @@ def _interval(a: Alignment, covariance: Covariance, noise_share: float) -> tuple
     above = above - above.min() - rise
     centre = int(np.argmin(above))
     return (_crossing(tau, above, centre, -1), _crossing(tau, above, centre, 1))
+
+
+def _with_jumps(fit: TimeOffsetFit) -> tuple[float, float]:
+    """Return the interval as much wider as a clock's jumps, whose sizes the V takes for known, make sigma."""
+    if fit.clock is None or not fit.clock.jumps:
+        return fit.interval
+    tau = fit.alignment.tau
+    wider = fit.sigma / replace(fit, clock=None).sigma
+    low, high = (tau + wider * (end - tau) for end in fit.interval)
+    return low, high
 
 
 def _crossing(x: Array, y: Array, start: int, step: int) -> float:

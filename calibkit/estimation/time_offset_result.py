@@ -8,7 +8,7 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import find_transform, make_time_offset
 from calibkit.data.verdict import Reason, Status, Verdict, worst
-from calibkit.estimation.alignment import Alignment
+from calibkit.estimation.alignment import Alignment, open_axes
 from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset import TimeOffsetFit
@@ -122,7 +122,8 @@ def _lines(pair: Pair, fit: TimeOffsetFit, frame_hz: float | None, delays: Delay
     lines += [f"  {text}" for text in delays.told(pair.of, pair.to, fit.td)]
     if len(a.R) == 3:
         v = np.degrees(so3.log(a.R))
-        lines.append(f"  rotation found on the way: R_{pair.of}_{pair.to} = exp({v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}) deg")
+        unknown = "".join(f"; about ({x:.1f}, {y:.1f}, {z:.1f}) of {pair.of} these turns do not tell it" for x, y, z in np.round(open_axes(a), 1) + 0.0)
+        lines.append(f"  rotation found on the way: R_{pair.of}_{pair.to} = exp({v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}) deg{unknown}")
     return lines
 
 
@@ -174,7 +175,9 @@ def _against_rig(pair: Pair, fit: TimeOffsetFit, base: Rig) -> list[Reason]:
     found = find_transform(base, pair.of, pair.to)
     if found is None or len(fit.alignment.R) != 3 or not fit.alignment.free_rotation:
         return []
-    apart = so3.log(found[0][:3, :3].T @ fit.alignment.R)
+    apart = so3.log(fit.alignment.R @ found[0][:3, :3].T)
+    free = open_axes(fit.alignment)
+    apart = apart - free.T @ (free @ apart)
     if np.linalg.norm(apart) < _TURNED:
         return []
     turned = np.degrees(np.linalg.norm(apart))

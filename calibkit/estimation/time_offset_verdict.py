@@ -23,16 +23,20 @@ _UNLIKE = 0.5  # of the turns may be left unexplained
 _STRANGERS = 0.9
 _SCALE, _OTHER_UNIT = 0.03, 0.2  # of the turns' sizes
 _SURE = 10.0  # sigmas
+_ALIKE_IN_FORM = 0.5  # squared correlation; of strangers' turns no scale is told
 _LOST = 0.1  # of the turns may be outliers
 _MOSTLY_LOST = 0.5
 _CONTRARY = 1.4  # of an axis' turns is left by a prediction of the wrong sign: 2; by one that has nothing to do with it, 1
 _EXPLAINED = 0.3
+_TURNING = 0.2  # of the liveliest axis' turns: about one that hardly turns there is noise alone
 _MISSING = 0.05  # of the frames
 _JITTER_S = 5e-4
 _WORSE = 3.0  # sigma over that of independent residuals
 _APART = 16.0  # chi-squared of the axes' own offsets about their mean
 _SAME_S = 1e-5  # axes may be so far apart: a gyroscope's integration leaves that at 4 rad/s, and a tenth of SCALES["s"] matters to nobody
 _GOOD_CHANGE = 4.0  # rad/s^2 rms: 1 rad/s back and forth about every axis at 0.6 Hz
+_SPARSE, _SPARSE_HZ = 0.67, 30.0  # of the other's rate
+_INVERSE = "poses those of the world seen from the sensor (--inverse-poses)"
 _MOTION = "turn the rig back and forth about two or more axes, 30 to 60 deg each way, once or twice a second, for 30 s"
 
 
@@ -42,6 +46,7 @@ class Judged:
 
     status: Status
     reasons: tuple[Reason, ...]
+    coarse: bool = False  # not observable only for its sigma: still a start for what else tells it
 
 
 def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: dict[str, StampReport]) -> Judged:
@@ -49,19 +54,26 @@ def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: d
     why = _not_observable(of, to, fit)
     found = [(sensor, text) for sensor, report in stamps.items() for text in stamps_in_words(report, _MISSING, _JITTER_S)]
     spoilt = [Reason(Verdict.CHECK, f"{sensor}: {text}") for sensor, text in found]
-    scale = [Reason(verdict, f"{name}: {text}") for verdict, text in _scale(of, to, fit)]
-    if why:
-        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {why}"), *scale, *spoilt))
+    scale = _scale(of, to, fit)
     known = grade(fit.sigma / SCALES["s"])
-    if known == "not observable":
-        text = f"not observable: its sigma would be {fit.sigma * 1e3:.2g} ms; {_advice(fit)}"
-        return Judged(Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: {text}"), *scale, *spoilt))
+    coarse = not why and known == "not observable"
+    if coarse:
+        why = f"its sigma would be {fit.sigma * 1e3:.2g} ms; {_advice(fit)}"
+    if why:
+        other = [text for verdict, text in scale if verdict is Verdict.FAIL]  # what makes a fit bad is the reason, and no lack of motion
+        return Judged(
+            Status.NOT_OBSERVABLE, (Reason(Verdict.FAIL, f"{name}: not observable: {other[0] if other else why}"), *spoilt), coarse
+        )
     reasons = []
     if known == "weak":
         reasons.append(Reason(Verdict.CHECK, f"{name}: weak: known to {fit.sigma * 1e3:.2g} ms only; {_advice(fit)}"))
     frame_hz = stamps[of].rate_hz if of in stamps else None
-    reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in _doubts(of, to, fit, frame_hz)]
-    return Judged(Status(known), (*reasons, *scale, *spoilt))
+    reasons += [Reason(verdict, f"{name}: {text}") for verdict, text in (*_doubts(of, to, fit, frame_hz), *scale)]
+    to_hz = stamps[to].rate_hz if to in stamps else None
+    if frame_hz and to_hz and to_hz < min(_SPARSE * frame_hz, _SPARSE_HZ):
+        text = f"{to} comes at {to_hz:.3g} Hz only: what it does between its samples may bend td by 0.1 ms and more"
+        reasons.append(Reason(Verdict.CHECK, f"{name}: {text}; give it as --of and {of} as --to"))
+    return Judged(Status(known), (*reasons, *spoilt))
 
 
 def rates(fit: TimeOffsetFit) -> tuple[float, float]:
@@ -77,13 +89,18 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
     known = track.rate[track.chain >= 0]
     middle, fast = rates(fit)
     change = _change(fit)
+    if fit.gain >= _ALIKE and fit.depth >= _BOWL and fit.noise_share > _PRETENDED:
+        return (
+            f"{100 * fit.noise_share:.0f} % of what seems to tell it is the noise of {to}'s rates: turn faster, or give less noisy ones "
+            f"(--of {to} --to {of} if {of} is less noisy)"
+        )
     if fit.gain < _ALIKE or fit.noise_share > _PRETENDED or fit.depth < _BOWL:
         if fast < _STILL or float(np.median(np.linalg.norm(known, axis=1))) < _STILL:
             return f"the rig hardly turns ({middle:.2g} rad/s in the middle): at rest every offset fits alike; {_MOTION}"
         if change > 0.3 and (fit.gain < _ALIKE or _unlike(fit) > _UNLIKE):
             return (
                 f"{of} and {to} never turn alike at any offset: are both on one rigid body, do they overlap in time, is a topic wrong, "
-                "or are the poses those of the world seen from the sensor (--inverse-poses)?"
+                f"or are {_INVERSE}?"
             )
         return f"the rate of turn hardly changes (about {middle:.2g} rad/s): a constant rate fits every offset alike; {_MOTION}"
     if not 1 < int(np.argmin(fit.cost)) < len(fit.cost) - 2:
@@ -107,7 +124,9 @@ def _advice(fit: TimeOffsetFit) -> str:
     """Name the motion to add, and what it would bring: sigma goes with 1 / (rms of d omega / dt)."""
     better = fit.sigma * min(1.0, _change(fit) / _GOOD_CHANGE)
     return (
-        f"{_MOTION}: about {better * 1e3:.1g} ms" if better < 0.7 * fit.sigma else f"record longer: four times as long halves it; {_MOTION}"
+        f"{_MOTION}; that would tell it to about {better * 1e3:.1g} ms"
+        if better < 0.7 * fit.sigma
+        else f"record longer: four times as long halves it; {_MOTION}"
     )
 
 
@@ -125,15 +144,11 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit, frame_hz: float | None) -> lis
         found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, to, frame_hz)]
     if fit.alignment.levels.jitter > _JITTER_S**2:
         jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
-        found.append(
-            (
-                Verdict.CHECK,
-                f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms, or it is worse in fast motion",
-            )
-        )
+        text = f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms"
+        found.append((Verdict.CHECK, f"{text}; or those of {to} do, or it is worse in fast motion"))
     if (unlike := _unlike(fit)) > _UNLIKE:
         verdict = Verdict.FAIL if unlike > _STRANGERS else Verdict.CHECK
-        found.append((verdict, f"{of} and {to} turn only partly alike: {100 * unlike:.0f} % of the turns is noise"))
+        found.append((verdict, f"{of} and {to} turn only partly alike: {100 * unlike:.0f} % of the turns is noise, or {_INVERSE}"))
     lost = 1 - sum(int(keep.sum()) for keep in fit.alignment.keep) / max(fit.n_turns, 1)
     if lost > _LOST:
         verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
@@ -172,22 +187,30 @@ def _scale(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     information = max(float(np.sum(other**2)), 1e-300)
     scale = float(np.sum(own * other)) / information if len(a.R) == 3 else float(np.linalg.norm(a.R))
     sigma = np.sqrt(fit.covariance.variance_factor / information)
-    if scale < _SURE * sigma or abs(scale - 1) < max(_SCALE, _SURE * sigma, fit.noise_share):
+    alike = scale**2 * information > _ALIKE_IN_FORM * float(np.sum(own**2))
+    if not alike or scale < _SURE * sigma or abs(scale - 1) < max(_SCALE, _SURE * sigma, fit.noise_share):
         return []
     verdict = Verdict.FAIL if abs(np.log(scale)) > _OTHER_UNIT else Verdict.CHECK
     degrees = abs(abs(np.log(scale)) - np.log(180 / np.pi)) < _OTHER_UNIT
-    cause = "a gyroscope in deg/s: --gyro-unit" if degrees else "a gyroscope's scale or unit, or a wrong focal length; calibrate that first"
+    cause = (
+        "degrees taken for radians, or the other way round: check --gyro-unit"
+        if degrees
+        else "a gyroscope's scale or unit, or a wrong focal length; calibrate that first"
+    )
     return [(verdict, f"{of} turns {scale:.3g} times as far as {to}: {cause}")]
 
 
 def _contrary(of: str, to: str, fit: TimeOffsetFit) -> list[str]:
     """Say which axes the prediction makes worse while it explains others: a flipped sign that no rotation makes."""
     left, turned = _left_of_turns(fit)
-    share = np.sqrt(np.mean(left**2, axis=0) / np.maximum(np.mean(turned**2, axis=0), 1e-300))
-    worse = [axis for axis, each in zip("xyz", share, strict=False) if each > _CONTRARY]
+    size = np.sqrt(np.maximum(np.mean(turned**2, axis=0), 1e-300))
+    share = np.sqrt(np.mean(left**2, axis=0)) / size
+    turning = size > _TURNING * size.max()
+    worse = [axis for axis, each, turns in zip("xyz", share, turning, strict=False) if each > _CONTRARY and turns]
     if len(share) < 3 or not worse or share.min() > _EXPLAINED:
         return []
-    return [f"{' and '.join(worse)} of {of} goes against {to}, the other axes go with it: a flipped sign, or a left-handed frame"]
+    axes = f"about {' and '.join(worse)} while it goes with it about the others"
+    return [f"{of} turns against {to} {axes}: one axis or all three with a flipped sign, a left-handed frame, or {_INVERSE}"]
 
 
 def by_axis(fit: TimeOffsetFit) -> tuple[Array, Array]:

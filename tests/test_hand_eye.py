@@ -12,7 +12,8 @@ from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_ey
 from calibkit.estimation.hand_eye_asked import Asked
 from calibkit.estimation.hand_eye_data import WORDS, HandEyeData, of_motions, of_recording
 from calibkit.estimation.hand_eye_methods import METHODS
-from calibkit.estimation.hand_eye_normal import normal
+from calibkit.estimation.hand_eye_noise import RobotNoise
+from calibkit.estimation.hand_eye_normal import believed, normal
 from calibkit.estimation.hand_eye_pairs import motions
 from calibkit.estimation.hand_eye_refine import residuals
 from calibkit.estimation.hand_eye_result import hand_eye_result
@@ -180,6 +181,42 @@ def test_sigmas_of_ready_made_motions_are_honest(n_seeds: int) -> None:
         fits.append(calibrate_hand_eye(of_motions(A, B), ONLY_X))
         errors.append(error(fits[-1], X))
     assert_honest(errors, fits, n_seeds == SLOW)
+
+
+@pytest.mark.parametrize("n_seeds", seeds(), ids=str)
+@pytest.mark.parametrize(("setup", "n"), [("eye-in-hand", 4), ("eye-to-hand", 3), ("motion", 6)])
+def test_few_poses_do_not_make_the_likelihood_endless(setup: str, n: int, n_seeds: int) -> None:
+    """Without a floor on either kind of noise errors of sets of three were thousands of their sigmas."""
+    errors = []
+    for seed in range(n_seeds):
+        rng = np.random.default_rng((seed, n))
+        X, data, _ = recorded(setup, poses(rng, n, 0.6, 0.3), rng)
+        fit = calibrate_hand_eye(data, ONLY_X)
+        if all(each.grade != "not observable" for each in fit.open):
+            errors.append(error(fit, X) / np.sqrt(np.diag(fit.cov_X)))
+    print(setup, n, "poses:", len(errors), "told; error over sigma", np.sqrt(np.mean(np.square(errors), axis=0)).round(2))
+    assert len(errors) >= 0.6 * n_seeds
+    assert np.abs(errors).max() < 8  # noise that is told by 2 to 5 motions
+    assert np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+@pytest.mark.parametrize("finer", [3, 10])
+def test_a_robots_stated_noise_that_is_too_fine_is_raised(finer: float) -> None:
+    rng = np.random.default_rng(3)
+    X, data, _ = recorded("eye-in-hand", spread(rng, 20), rng)
+    fit = calibrate_hand_eye(data, Settings(methods=False, robot=RobotNoise(SIGMA_R / finer, SIGMA_P / finer)))
+    assert fit.kept.sum() >= 19
+    assert np.abs(error(fit, X) / np.sqrt(np.diag(fit.cov_X))).max() < 4
+
+
+def test_without_a_pose_that_fits_nothing_is_known() -> None:
+    rng = np.random.default_rng(3)
+    _, data, _ = recorded("eye-in-hand", spread(rng, 20), rng)
+    M, C = data.P, np.tile(np.eye(6), (20, 1, 1))
+    none = np.zeros(20, bool)
+    cov, system = believed(data, C, 0.5 * C, none, normal(data, M, C, np.zeros((20, 6)), none))
+    assert system.free.shape[1] == 0
+    assert np.all(np.sqrt(np.diag(cov)) > 1)
 
 
 def stream(rng: np.random.Generator, n: int, drift: float, lag: float = 0.0, white: tuple[float, float] = (1e-3, 1e-3)):

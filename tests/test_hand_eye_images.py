@@ -1,6 +1,7 @@
 """Hand-eye in the images: what corners say, honest sigmas of both setups, wrong poses and corners, robots of every kind, a free lens."""
 
 import json
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -165,12 +166,15 @@ def test_sigmas_are_honest(setup: str, n_seeds: int) -> None:
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_where_a_view_tells_its_pose_well_images_and_poses_give_the_same(setup: str) -> None:
-    """Where the poses' residuals do not make their noise larger than the corners' own, which images need not guess."""
-    same = 0
-    for s in range(FAST):
+    """Where residuals do not raise the noise that corners and robot are told to have: images and poses would each tell it by their own."""
+    same, told = 0, (ROBOT.rotation, ROBOT.translation)
+    for s in range(40):
+        if same == 2:
+            break
         _, G, views, _ = recorded(setup, s, noise_px=0.05)
         of_images, of_poses = solve(setup, G, views, robot=ROBOT)
-        if of_poses.noise["Q_factor"] == 1:
+        taken = [fit.noise[kind] for fit in (of_images, of_poses) for kind in ("P_rotation", "P_translation")]
+        if of_poses.noise["Q_factor"] == 1 and np.allclose(taken, (*told, *told), rtol=1e-6):
             same += 1
             sigma = np.sqrt(np.diag(of_images.cov_X))
             np.testing.assert_array_less(np.abs(se3.local(of_poses.X, of_images.X)), 0.01 * sigma)
@@ -185,8 +189,8 @@ def test_what_the_robots_noise_is_told_to_be_is_taken(n_seeds: int) -> None:
         robot = RobotNoise(np.deg2rad(0.1), 1e-4)
         X, G, views, _ = recorded("eye-to-hand", s, 12, robot)
         fit = solve("eye-to-hand", G, views, robot=robot)[0]
-        assert fit.noise["P_rotation"] == pytest.approx(robot.rotation)
-        assert fit.noise["P_translation"] == pytest.approx(robot.translation)
+        assert robot.rotation <= fit.noise["P_rotation"] < 1.6 * robot.rotation  # residuals may raise it
+        assert robot.translation <= fit.noise["P_translation"] < 1.6 * robot.translation
         errors.append(error(fit, X))
         covs.append(fit.cov_X)
     assert_honest(errors, covs, n_seeds >= SLOW)
@@ -394,9 +398,12 @@ def test_the_command_frees_the_lens_and_writes_it_as_asked_for(run: Run, tmp_pat
 def test_the_command_takes_a_robots_noise_and_says_where_it_is_not_exact(run: Run, tmp_path: Path) -> None:
     _, G, views, _ = recorded("eye-in-hand", 0)
     asked = files(tmp_path, views, G, lens())
-    given = run("handeye", *asked, "--robot-noise", "0.3,0.05")
+    given = run("handeye", *asked, "--robot-noise", "0.6,0.1")
     assert given.code == 0, given
-    assert "the robot turned by 0.05 deg, the robot placed by 0.3 mm" in given.out
+    assert "the robot turned by 0.1 deg, the robot placed by 0.6 mm" in given.out
+    fine = run("handeye", *asked, "--robot-noise", "0.05,0.005")
+    assert "20 of 20 poses used" in fine.out
+    assert re.search("CHECK the robot's turns err by (8|9|1.) times what --robot-noise states", fine.out), fine.out
     exact = run("handeye", *asked, "--robot-noise", "exact")
     assert exact.code == 0, exact
     assert "CHECK with exact robot poses the corners are off by" in exact.out

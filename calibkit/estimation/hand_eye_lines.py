@@ -30,7 +30,8 @@ def lines(name: str, fixed: str, fit: HandEyeFit, asked: Asked, wrong: tuple[Sus
     lines.append(f"  scatter of {fixed}, which should be one transform: {size}{each}")
     if asked.px is not None and fit.kept.any():
         lines.append(f"  the board where the robot's poses say it is, in the images: rms {plain(_rms(asked.px[fit.kept]), 3)} px")
-    lines.append(f"  noise, {'assumed (too few poses tell it)' if fit.noise_assumed else 'told by the residuals'}: {_noise(fit)}")
+    how = "assumed (too few poses tell it)" if fit.noise_assumed else "as stated or told by the residuals"
+    lines.append(f"  noise, {how}: {_noise(fit)}")
     for each_wrong in wrong[:_WORST]:
         size = f"{plain(np.degrees(each_wrong.angle), 3)} deg, {plain(1e3 * each_wrong.distance, 3)} mm"
         lines.append(f"  left out: {one_line(each_wrong.label, 60)} ({size}){': ' + each_wrong.why if each_wrong.why else ''}")

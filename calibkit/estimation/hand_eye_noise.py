@@ -14,6 +14,7 @@ _FACTORS = (1.0, 3.0)  # that a given covariance may be too small by: what corne
 _FEWEST = 3  # poses whose residuals tell of noise
 _CHANCE = 1e-2  # of arms with white noise are taken for others: that costs accuracy, to miss one costs honesty
 _SAME = 1e-3
+_SINGULAR = 3.0  # of the residuals' freedom; set by sets of 3 to 6 poses, 8 and more hardly feel it
 _FINEST = 1e-14  # variance: nothing is known to better than 0.1 urad and 0.1 um
 
 
@@ -50,15 +51,19 @@ def first(data: HandEyeData, e: Array, robot: RobotNoise | None, in_images: bool
         factors = (1.0, np.inf)  # the corners take all of it
     elif in_images:
         factors = (_FINEST, np.inf)  # thousands of corners tell their own
+    # The fit of few poses takes one kind of noise all, whose likelihood then has no end: sigmas of 4 poses were 30 times too small.
+    share = min(1.0, _SINGULAR / max(6 * (len(e) - data.n_worlds - 1), 1)) if robot is None else 0.0
     bounds = {
-        "rotation": (phi / 2, _FINEST, 9 * phi),
-        "translation": (rho / 2, _FINEST, 9 * rho),
+        "rotation": (phi / 2, max(share * phi / 2, _FINEST), 9 * phi),
+        "translation": (rho / 2, max(share * rho / 2, _FINEST), 9 * rho),
         "factor": (1.0, *factors),
     }
     theta, least, most = np.array([bounds[name.split("_")[1]] for name in names(data)]).T
-    if robot is not None and data.cov_P is None:
-        least[:2] = most[:2] = np.maximum([robot.rotation**2, robot.translation**2], _FINEST)
     most = np.maximum(most, least)
+    if robot is not None and data.cov_P is None:
+        # A stated repeatability is often finer than what the arm's geometry is worth: residuals may raise it.
+        least[:2] = np.maximum([robot.rotation**2, robot.translation**2], _FINEST)
+        most[:2] = least[:2] if robot.exact else np.maximum(most[:2], least[:2])
     return np.clip(theta, least, most), least, most
 
 

@@ -103,7 +103,7 @@ def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal
         by_chance = by_chance * (1 + (np.sqrt(2) + 3) / np.sqrt(max(len(used) - worlds, 1))) ** 2
     values, vectors = np.linalg.eigh((system.S - by_chance) * units)
     whole = np.einsum("ij,ik,kj->j", vectors, system.S * units, vectors)
-    empty = values < np.maximum(whole / 2, max(_NOTHING, _ROUNDING * values[-1]))
+    empty = values < np.maximum(whole / 2, max(2 * _NOTHING, _ROUNDING * values[-1]))  # twice: without a pose R's is that of _FAR alone
     back = vectors * SCALES[:, None]
     return back / np.where(empty, _NOTHING, values) @ back.T, replace(system, free=vectors[:, ~empty] * SCALES[:, None])
 

@@ -122,7 +122,8 @@ def _lines(pair: Pair, fit: TimeOffsetFit, frame_hz: float | None, delays: Delay
     lines += [f"  {text}" for text in delays.told(pair.of, pair.to, fit.td)]
     if len(a.R) == 3:
         v = np.degrees(so3.log(a.R))
-        unknown = "".join(f"; about ({x:.1f}, {y:.1f}, {z:.1f}) of {pair.of} these turns do not tell it" for x, y, z in np.round(open_axes(a), 1) + 0.0)
+        axes = np.round(open_axes(a), 1) + 0.0
+        unknown = "".join(f"; about ({x:.1f}, {y:.1f}, {z:.1f}) of {pair.of} these turns do not tell it" for x, y, z in axes)
         lines.append(f"  rotation found on the way: R_{pair.of}_{pair.to} = exp({v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}) deg{unknown}")
     return lines
 

@@ -456,6 +456,14 @@ def test_every_mistake_is_one_line(run: Run, photos: Path, tmp_path: Path) -> No
         (("--pairs", rows(tmp_path / "mm.txt", mm), "--pairs", rows(tmp_path / "b.txt", second)), "--pose-unit mm"),
         (("--pairs", rows(tmp_path / "bent.txt", bent), "--pairs", rows(tmp_path / "b.txt", second)), "line 5"),
         ((tmp_path / "arm.csv",), "arm.csv does not exist"),
+        ((images, "--target", target, "--poses", poses, "--motions", *known), "--motions: "),
+        ((images, "--target", target, "--poses", poses, "--inverse-second", *known), "--inverse-second: "),
+        ((images, "--target", target, "--poses", poses, "--pose", "/foo", *known), "--pose: "),
+        ((*pairs.asked, "--motions", "--setup", "eye-in-hand"), "--setup: "),
+        ((*pairs.asked, "--setup", "motion", "--base", "foo"), "--base and --gripper: "),
+        ((tmp_path / "arm.csv", "--pose-unit", "mm"), "--pose-unit"),
+        ((*pairs.asked, "--setup", "eye-in-hand", "--base", "cam"), "two frames would have one name, of gripper, cam, cam, target"),
+        ((*pairs.asked, "--setup", "eye-in-hand", "--gripper", "target"), "two frames would have one name"),
     ]
     for asked, told in cases:
         said: Said = run(*asked, "-o", tmp_path / "never.yaml")

@@ -87,6 +87,27 @@ def _check(options: Options) -> None:
     if not 0 <= options.predict <= MAX_PREDICTED:
         raise BadInputError(f"--predict {options.predict}: give 0 to {MAX_PREDICTED}")
     check(options)
+    _refuse_idle(options)
+
+
+def _refuse_idle(options: Options) -> None:
+    """Refuse options that say nothing about what is given: a person who gives one expects it to count."""
+    files, motion = bool(options.pose_files), options.motions or options.setup == "motion"
+    idle = {
+        "--motions": options.motions and not options.pairs and "it says what --pairs are",
+        "--setup": options.motions and options.setup not in (None, "motion") and "motions of two sensors have no gripper: leave it out",
+        "--inverse-second": options.inverse_second
+        and options.poses is not None
+        and "the board's poses are found here; --inverse-poses",
+        "--pose": options.pose and files and "it chooses a stream of a recording, and a file of poses is given",
+        "--base and --gripper": motion and (options.base or options.gripper) and "two sensors have neither",
+        "--pose-format, --pose-unit and --angle-unit": (options.pose_format or options.pose_unit or options.angle_unit)
+        and not files
+        and "they are for --poses and --pairs; a stream is in m and quaternions",
+    }
+    for name, why in idle.items():
+        if why:
+            raise BadInputError(f"{name}: {why}")
 
 
 def _choice(sides: Sides, options: Options) -> Choice:
@@ -98,6 +119,8 @@ def _choice(sides: Sides, options: Options) -> Choice:
 
 def _problem(sides: Sides, choice: Choice, options: Options) -> HandEyeData:
     frames = sides.words(choice.setup)
+    if len(set(frames)) < len(frames):
+        raise BadInputError(f"two frames would have one name, of {', '.join(frames)}: choose others with --base and --gripper")
     if options.motions:
         return of_motions(sides.first, sides.second, sides.labels, frames)
     t_s = None if sides.t_ns is None else np.asarray((sides.t_ns - sides.t_ns.min()) * 1e-9, np.float64)

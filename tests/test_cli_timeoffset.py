@@ -24,6 +24,7 @@ from calibkit.data.transforms import make_time_offset, make_transform
 from calibkit.data.verdict import Status, Verdict
 from calibkit.detection.tracks import track_features
 from calibkit.geometry import se3
+from calibkit.io.bag_writer import ImuPayload, Sample, Stream, write_bag
 from calibkit.io.residual_file import load_result
 from calibkit.io.rig_file import load_rig, save_rig
 from calibkit.io.target_file import dump_target
@@ -268,6 +269,17 @@ def test_two_imus(run: Run, body: Trajectory, imu_file: Path, tmp_path: Path) ->
     said = run("timeoffset", imu_file, second, "-o", tmp_path / "rig.yaml")
     assert_told(said, "imu1", "imu0")
     assert_found(offset(tmp_path / "rig.yaml", "dt_imu0_imu1"))
+
+
+def test_times_of_recording_are_doubted(run: Run, body: Trajectory, imu_file: Path, tmp_path: Path) -> None:
+    """An IMU whose header stamps are zero is dated by when it was recorded, which is no time of its own."""
+    other = seen_gyro(body, stamps(100, DURATION_S - 2, 1.003), np.random.default_rng(5), None, R_OF_TO.T, TD)
+    rows = zip(other.t_ns, other.gyro, other.accel, strict=True)
+    messages = [Sample(int(t) + 3_000_000, 0, ImuPayload(gyro, accel)) for t, gyro, accel in rows]
+    write_bag(tmp_path / "other.bag", [Stream("/imu", "imu", "imu", messages)], "ros1")
+    said = run("timeoffset", imu_file, tmp_path / "other.bag", "-o", tmp_path / "rig.yaml")
+    assert said.code == 0, said
+    assert re.search(r"CHECK dt_\S+: /imu: 1300 header stamps are zero: record times are used", said.out), said.out
 
 
 def test_wheels_and_an_imu(run: Run, tmp_path: Path) -> None:

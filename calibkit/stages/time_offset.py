@@ -12,6 +12,7 @@ from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
 from calibkit.data.transforms import find_transform
+from calibkit.data.verdict import Reason, Verdict
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset import Settings, bootstrap_sigma, fit_time_offset
@@ -26,6 +27,7 @@ from calibkit.stages.sensors import Sensor, choose_pair, find_sensors
 
 _DEFAULT = ImuOptions()
 _NO_DELAYS = Delays()
+_RECORD_TIMES = "record times are used"
 _STAMPED = {"image": "frame", "corners": "frame", "pose": "pose", "tf": "pose"}  # what has a stamp
 _FEWEST_DRAWN = 9  # stretches; the spread over draws of fewer says more of chance than of td
 
@@ -86,7 +88,9 @@ def time_offset(
         warnings.append(
             f"--bootstrap: {there} of 5 s are too few to draw from, {_FEWEST_DRAWN} are needed: record {5 * _FEWEST_DRAWN} s or more"
         )
-    result = replace(result, facts={**result.facts, "warnings": warnings})
+    recorders = [text for text in recording.warnings if _RECORD_TIMES in text]  # no times of the sensor: td is the recorder's delay, too
+    doubts = [Reason(Verdict.CHECK, f"dt_{to.name}_{of.name}: {text}, so it holds how late they were recorded") for text in recorders]
+    result = replace(result, reasons=(*result.reasons, *doubts), facts={**result.facts, "warnings": warnings})
     read = [*outputs.rigs, *([options.target] if options.target else [])]  # the lens, and the board
     inputs = [*recording.inputs(), *((path.name, sha256(path.read_bytes()).hexdigest()) for path in read)]
     return save(result, base, outputs, inputs, _told(options, of, to))

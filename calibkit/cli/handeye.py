@@ -61,7 +61,8 @@ def run(
         typer.Option(
             "--robot-noise",
             metavar="MM,DEG",
-            help="Sigmas of the robot's poses, per coordinate, where you know them (0.1,0.02; more if the residuals have more); auto: told by the residuals; exact: none, "
+            help="Sigmas of the robot's poses, per coordinate, where you know them (0.1,0.02; more if the residuals have more); "
+            "auto: told by the residuals; exact: none, "
             "the reprojection error alone decides, which a robot that is not pays for with an X that is wrong by much more than its sigma.",
         ),
     ] = "auto",

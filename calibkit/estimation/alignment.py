@@ -38,7 +38,7 @@ _WINDOW_STEP_S = 0.002
 _WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
 _FURTHEST_S = 0.8  # that a stretch's own bottom is looked for
 _OPEN = 1e-4  # of the best axis' information: a hundredth of the turns, which noise and a lens' errors are worth
-_KNOWN = 0.03  # rad
+_KNOWN, _WELL = 0.03, 0.01  # rad, or of an axis' length
 _DRAWS = 8
 _SLAB = 2_000_000  # numbers held at once
 
@@ -190,6 +190,17 @@ def open_axes(a: Alignment) -> Array:
     values, vectors = np.linalg.eigh(_gram(columns(a))[:3, :3])
     axes = vectors[:, (values < _OPEN * values[-1]) | (values < _KNOWN**-2)].T
     return np.asarray(axes * np.sign(axes[np.arange(len(axes)), np.argmax(np.abs(axes), axis=1)])[:, None], np.float64)
+
+
+def length_of_axis(a: Alignment) -> float:
+    """Return the length of the one axis R (1, 3): of all of it or of what is well known of it, whichever is nearer to 1.
+
+    Where a vehicle stays level its turns tell one component of the axis; noise in the others would lengthen it.
+    """
+    values, vectors = np.linalg.eigh(_gram(columns(a))[:3, :3])
+    known = np.linalg.norm(a.R @ vectors[:, values > _WELL**-2])
+    whole = np.linalg.norm(a.R)
+    return 1.0 if (whole - 1) * (known - 1) < 0 else float(min(whole, known, key=lambda length: abs(length - 1)))
 
 
 def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.data.verdict import Reason, Status, Verdict
-from calibkit.estimation.alignment import axis_offsets, turned_by
+from calibkit.estimation.alignment import axis_offsets, length_of_axis, turned_by
 from calibkit.estimation.clock import describe
 from calibkit.estimation.slow_turns import LONG_S
 from calibkit.estimation.stamps import StampReport
@@ -182,12 +182,11 @@ def _left_of_turns(fit: TimeOffsetFit) -> tuple[Array, Array]:
 
 def _scale(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
     """Say so where one turns by more than the other: s = sum alpha . R beta / sum |R beta|^2 of whitened turns, for one axis |R|."""
-    a = fit.alignment
-    own, other = turned_by(a)
+    own, other = turned_by(fit.alignment)
     information = max(float(np.sum(other**2)), 1e-300)
-    scale = float(np.sum(own * other)) / information if len(a.R) == 3 else float(np.linalg.norm(a.R))
+    scale = float(np.sum(own * other)) / information if len(fit.alignment.R) == 3 else length_of_axis(fit.alignment)
     sigma = np.sqrt(fit.covariance.variance_factor / information)
-    alike = scale**2 * information > _ALIKE_IN_FORM * float(np.sum(own**2))
+    alike = scale**2 * information > _ALIKE_IN_FORM * float(np.sum(own**2)) or len(fit.alignment.R) == 1
     if not alike or scale < _SURE * sigma or abs(scale - 1) < max(_SCALE, _SURE * sigma, fit.noise_share):
         return []
     verdict = Verdict.FAIL if abs(np.log(scale)) > _OTHER_UNIT else Verdict.CHECK

@@ -72,10 +72,8 @@ def check_stamps(t_ns: Times, noun: str = "frame") -> StampReport:
     stamps = t_ns[~zeros]
     far, far_s = _far_off(stamps)
     stamps = stamps[~far]
-    ordered = np.sort(stamps)
-    unique = ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+    t_s = _seconds(stamps)
     backward = int(np.sum(np.diff(stamps) < 0))
-    t_s = (unique - unique[0]) * 1e-9 if len(unique) else np.zeros(0)
     bursts = _in_bursts(t_s)
     period = _period(t_s) if len(t_s) >= _LEAST and not bursts else None
     empty = jitter = sigma = None
@@ -85,13 +83,13 @@ def check_stamps(t_ns: Times, noun: str = "frame") -> StampReport:
         if coherence < _COHERENT:
             period = None
         else:
-            empty = max(0, ticks - len(unique))
+            empty = max(0, ticks - len(t_s))
             jitter, sigma = _jitter(t_s, period, offset)
     return StampReport(
         count=len(t_ns),
         period_s=period,
         empty=empty,
-        duplicates=len(stamps) - len(unique),
+        duplicates=len(stamps) - len(t_s),
         zeros=int(np.sum(zeros)),
         far=int(np.sum(far)),
         far_s=far_s,
@@ -101,6 +99,19 @@ def check_stamps(t_ns: Times, noun: str = "frame") -> StampReport:
         bursts=bursts,
         noun=noun,
     )
+
+
+def come_in_bursts(t_ns: Times) -> bool:
+    """Whether stamps (n,) are times of arrival: several at once, then none."""
+    stamps = t_ns[~_unset(t_ns)]
+    return _in_bursts(_seconds(stamps[~_far_off(stamps)[0]]))
+
+
+def _seconds(stamps: Times) -> Array:
+    """Return different stamps in order, in s from the first."""
+    ordered = np.sort(stamps)
+    unique = ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+    return np.asarray((unique - unique[0]) * 1e-9 if len(unique) else np.zeros(0), np.float64)
 
 
 def _unset(t_ns: Times) -> NDArray[np.bool_]:

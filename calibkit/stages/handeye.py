@@ -96,9 +96,7 @@ def _refuse_idle(options: Options) -> None:
     idle = {
         "--motions": options.motions and not options.pairs and "it says what --pairs are",
         "--setup": options.motions and options.setup not in (None, "motion") and "motions of two sensors have no gripper: leave it out",
-        "--inverse-second": options.inverse_second
-        and options.poses is not None
-        and "the board's poses are found here; --inverse-poses",
+        "--inverse-second": options.inverse_second and options.poses is not None and "the board's poses are found here; --inverse-poses",
         "--pose": options.pose and files and "it chooses a stream of a recording, and a file of poses is given",
         "--base and --gripper": motion and (options.base or options.gripper) and "two sensors have neither",
         "--pose-format, --pose-unit and --angle-unit": (options.pose_format or options.pose_unit or options.angle_unit)

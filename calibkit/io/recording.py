@@ -27,7 +27,7 @@ _OPTIONS = {  # that choose a topic of this kind
     "corners": "--camera",
     "imu": "--imu",
     "pose": "--pose",
-    "twist": "--pose",
+    "twist": "--of or --to",
 }
 
 

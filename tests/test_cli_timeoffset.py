@@ -279,7 +279,7 @@ def test_times_of_recording_are_doubted(run: Run, body: Trajectory, imu_file: Pa
     write_bag(tmp_path / "other.bag", [Stream("/imu", "imu", "imu", messages)], "ros1")
     said = run("timeoffset", imu_file, tmp_path / "other.bag", "-o", tmp_path / "rig.yaml")
     assert said.code == 0, said
-    assert re.search(r"CHECK dt_\S+: /imu: 1300 header stamps are zero: record times are used", said.out), said.out
+    assert re.search(r"CHECK dt_\S+: 1300 stamps of imu1 are zero in the header and times of recording are used", said.out), said.out
 
 
 def test_wheels_and_an_imu(run: Run, tmp_path: Path) -> None:

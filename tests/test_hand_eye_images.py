@@ -403,10 +403,10 @@ def test_the_command_takes_a_robots_noise_and_says_where_it_is_not_exact(run: Ru
     assert "the robot turned by 0.1 deg, the robot placed by 0.6 mm" in given.out
     fine = run("handeye", *asked, "--robot-noise", "0.05,0.005")
     assert "20 of 20 poses used" in fine.out
-    assert re.search("CHECK the robot's turns err by (8|9|1.) times what --robot-noise states", fine.out), fine.out
+    assert re.search("CHECK T_gripper_cam0: the robot's turns err by (8|9|1.) times what --robot-noise states", fine.out), fine.out
     exact = run("handeye", *asked, "--robot-noise", "exact")
     assert exact.code == 0, exact
-    assert "CHECK with exact robot poses the corners are off by" in exact.out
+    assert "CHECK T_gripper_cam0: with exact robot poses the corners are off by" in exact.out
     for words, mistake in (
         (("--robot-noise", "0.3"), "write auto, exact, or MM,DEG"),
         (("--robot-noise", "-1,0.1"), "write auto, exact, or MM,DEG"),

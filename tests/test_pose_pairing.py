@@ -230,7 +230,7 @@ def test_a_moving_robot_with_lag_and_30_percent_gaps() -> None:
     check_honest([normalised(fit) for _, fit in found], 0.4, 1.6)
     assert np.abs(of_offset(found)).max() < 3.5
     for pairing, fit in found:
-        assert all(re.search("frames are missing|fall into gaps", reason.text) for reason in pairing.reasons)
+        assert all(re.search("poses are missing|fall into gaps", reason.text) for reason in pairing.reasons)
         assert pairing.offset.sigma < 5e-4
         assert np.sqrt(np.diag(fit.cov_X)[:3]).max() < 2e-3
 

@@ -13,7 +13,9 @@ from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import make_time_offset
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
-from calibkit.estimation.alignment import Alignment, axis_offsets, columns, newton, sweep, weighed, window_offsets
+from calibkit.estimation.alignment import Alignment, columns, newton, sweep, weighed
+from calibkit.estimation.alignment_axes import axis_offsets
+from calibkit.estimation.clock_windows import window_offsets
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro
 from calibkit.estimation.rough_offset import masked_correlation, rough_offsets
 from calibkit.estimation.time_offset import Settings, bootstrap_sigma, fit_time_offset

@@ -27,7 +27,7 @@ from time_offset_samples import (
 from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.verdict import Status, Verdict
 from calibkit.errors import BadInputError
-from calibkit.estimation.alignment import open_axes
+from calibkit.estimation.alignment_axes import open_axes
 from calibkit.estimation.slow_turns import joined_up, turns_in_long_one
 from calibkit.estimation.turns import Turns, turns_of_poses
 from calibkit.geometry import so3

@@ -32,25 +32,10 @@ _MEDIAN = {1: 0.455, 2: 1.386, 3: 2.366}  # of chi-squared
 _STEPS = 15
 _CLOSE = 1e-6  # chi-squared that a step still gains
 _SETTLED = 0.03  # sigmas of tau: the rotation that turns about one axis leave open may creep on
-_PRIOR = np.array([TILT**-2, TILT**-2, TILT**-2, 0.0])
+PRIOR = np.array([TILT**-2, TILT**-2, TILT**-2, 0.0])
 _LONGEST_STEP_S = 0.05
-_WINDOW_STEP_S = 0.002
-_WINDOW_DEPTH = 12.0  # chi-squared of a stretch's own bottom below its rim; one that is flatter tells nothing
-_FURTHEST_S = 0.8  # that a stretch's own bottom is looked for
-_OPEN = 1e-4  # of the best axis' information: a hundredth of the turns, which noise and a lens' errors are worth
-_KNOWN, _WELL = 0.03, 0.01  # rad, or of an axis' length
 _DRAWS = 8
 _SLAB = 2_000_000  # numbers held at once
-
-
-@dataclass(frozen=True)
-class Windows:
-    """The offset of each stretch that tells it alone, the rotation as in the whole."""
-
-    start: Array  # (w,) s of the track's time
-    stop: Array
-    tau: Array  # (w,) s
-    sigma: Array  # (w,) s
 
 
 @dataclass(frozen=True)
@@ -73,6 +58,11 @@ class Alignment:
         """Return the offset (m,) at the turns' times t (m,): tau, and how the clock departs from it."""
         drift = 0.0 if self.clock is None else self.clock.at(t) - self.clock.offset_s
         return np.asarray(np.full_like(t, self.tau) + drift, np.float64)
+
+    @property
+    def free(self) -> NDArray[np.intp]:
+        """Return the columns that are estimated: rotation (3) where it is free, and tau."""
+        return np.arange(0 if self.free_rotation else 3, 4)
 
     @property
     def turns(self) -> int:
@@ -131,8 +121,7 @@ def _without_outliers(a: Alignment, robust: bool) -> tuple[Mask, ...]:
     squares = []
     for stretch, keep in zip(a.stretches, a.keep, strict=True):
         shift = a.shift(stretch.t)
-        turned = stretch.beta(a.track, shift[:, None])
-        left = stretch.turns.angle[:, stretch.axes] - turned[:, 0] @ a.R.T
+        left = stretch.left(a.track, a.R, shift[:, None])[:, 0]
         bias = next(biases) if a.parts and keep.sum() >= LEAST_TURNS else np.median(left / stretch.turns.duration[:, None], axis=0)
         left = left - stretch.turns.duration[:, None] * bias
         D = np.tile(np.eye(d), (len(left), 1, 1)) if robust else stretch.noise(a.track, a.R, shift, a.shape).blocks(a.levels, d)
@@ -146,7 +135,7 @@ def newton(a: Alignment) -> Alignment:
     """Return the alignment at the bottom near it, by Gauss-Newton."""
     settled = False
     for _ in range(_STEPS):
-        H = _gram(columns(a))
+        H = gram(columns(a))
         step, sigma = _step(a, H)
         far = abs(step[3]) / _LONGEST_STEP_S
         step /= max(1.0, far)
@@ -159,8 +148,8 @@ def newton(a: Alignment) -> Alignment:
 
 def _step(a: Alignment, H: Array) -> tuple[Array, float]:
     """Return Gauss-Newton's step of rotation and tau (4,) for the columns' Gram matrix, and tau's sigma."""
-    free = np.arange(0 if a.free_rotation else 3, 4)
-    A = (H[:4, :4] + np.diag(_PRIOR))[np.ix_(free, free)]
+    free = a.free
+    A = (H[:4, :4] + np.diag(PRIOR))[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     inverse = np.linalg.pinv(A * scale[:, None] * scale, rcond=1e-13, hermitian=True)
     step = np.zeros(4)
@@ -170,7 +159,7 @@ def _step(a: Alignment, H: Array) -> tuple[Array, float]:
 
 def stepped(a: Alignment, parts: Sequence[Array]) -> tuple[float, list[Array]]:
     """Return by how much tau moves in one step of Gauss-Newton, and the columns of every part with the residuals that it leaves."""
-    step = _step(a, _gram(parts))[0]
+    step = _step(a, gram(parts))[0]
     return float(step[3]), [np.column_stack([X[:, :4], X[:, 4] - X[:, :4] @ step]) for X in parts]
 
 
@@ -179,28 +168,9 @@ def columns(a: Alignment) -> list[Array]:
     return [linearised(part, a.track, a.R, a.shift(part.stretch.t)) for part in a.parts]
 
 
-def _gram(parts: Sequence[Array]) -> Array:
+def gram(parts: Sequence[Array]) -> Array:
+    """Return the sum of X^T X over the columns of every part."""
     return np.asarray(sum((X.T @ X for X in parts), np.zeros((5, 5))), np.float64)
-
-
-def open_axes(a: Alignment) -> Array:
-    """Return the axes (k, 3) in the frame of the turns about which they hardly tell the rotation: all turning is about another one."""
-    if not a.free_rotation or len(a.R) != 3:
-        return np.zeros((0, 3))
-    values, vectors = np.linalg.eigh(_gram(columns(a))[:3, :3])
-    axes = vectors[:, (values < _OPEN * values[-1]) | (values < _KNOWN**-2)].T
-    return np.asarray(axes * np.sign(axes[np.arange(len(axes)), np.argmax(np.abs(axes), axis=1)])[:, None], np.float64)
-
-
-def length_of_axis(a: Alignment) -> float:
-    """Return the length of the one axis R (1, 3): of all of it or of what is well known of it, whichever is nearer to 1.
-
-    Where a vehicle stays level its turns tell one component of the axis; noise in the others would lengthen it.
-    """
-    values, vectors = np.linalg.eigh(_gram(columns(a))[:3, :3])
-    known = np.linalg.norm(a.R @ vectors[:, values > _WELL**-2])
-    whole = np.linalg.norm(a.R)
-    return 1.0 if (whole - 1) * (known - 1) < 0 else float(min(whole, known, key=lambda length: abs(length - 1)))
 
 
 def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
@@ -208,7 +178,7 @@ def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
 
     The rotation is eliminated as it acts at the alignment's own tau: y.y - (X^T y).(X^T X)^-1 (X^T y).
     """
-    square, pull, H = np.zeros(len(tau)), np.zeros((3, len(tau))), np.diag(_PRIOR[:3])
+    square, pull, H = np.zeros(len(tau)), np.zeros((3, len(tau))), np.diag(PRIOR[:3])
     for part in progress(a.parts, "the V", len(a.parts)):
         t = part.stretch.t
         shift = a.shift(t)
@@ -223,66 +193,10 @@ def sweep(a: Alignment, tau: Array, progress: Progress = silent) -> Array:
     return np.asarray(square - np.sum(pull * np.linalg.solve(H, pull), axis=0), np.float64)
 
 
-def window_offsets(a: Alignment, reach: float, halved: bool = False) -> Windows:
-    """Return the offset of each part by itself: the bottom of its own V, where it has one, then Gauss-Newton.
-
-    It is looked for within `reach`, and further where it lies at the edge: a clock that jumps leaves whole stretches far from the others.
-    A part with a jump inside has an offset on each side of it; `halved`, on each side of its middle.
-    """
-    jumps = [jump.t_s for jump in a.clock.jumps] if a.clock else []
-    cuts = [[float(part.stretch.t[[0, -1]].mean())] if halved else jumps for part in a.parts]
-    found = [_window(a, piece, reach) for part, at in zip(a.parts, cuts, strict=True) for piece in _cut(a, part, at)]
-    rows = np.array([row for row in found if row is not None], float).reshape(-1, 4)
-    return Windows(*(rows[:, k] for k in range(4)))
-
-
-def _cut(a: Alignment, part: Weighed, at: list[float]) -> list[Weighed]:
-    """Return the part, or what it has of turns on each side of some times."""
-    stretch = part.stretch
-    inside = [t for t in at if stretch.t[0] < t < stretch.t[-1]]
-    if not inside:
-        return [part]
-    first, last = (np.searchsorted(inside, stretch.t[end]) for end in (stretch.turns.first, stretch.turns.last))
-    between = [(first == k) & (last == k) for k in range(len(inside) + 1)]
-    cut = [Stretch(stretch.turns.select(keep), stretch.origin_ns, stretch.free_bias) for keep in between if keep.sum() >= LEAST_TURNS]
-    return [weigh(piece, piece.noise(a.track, a.R, a.shift(piece.t), a.shape), a.levels) for piece in cut]
-
-
-def _window(a: Alignment, part: Weighed, reach: float) -> tuple[float, float, float, float] | None:
-    stretch = part.stretch
-    base = a.shift(stretch.t)
-    grid = np.arange(-reach, reach + _WINDOW_STEP_S / 2, _WINDOW_STEP_S)
-    grid = grid[(stretch.t[0] + base[0] + grid >= 0) & (stretch.t[-1] + base[-1] + grid <= a.track.duration)]
-    if len(grid) < 3:
-        return None
-    cost = np.sum(residuals(part, a.track, a.R, base[:, None] + grid) ** 2, axis=0)
-    k = int(np.argmin(cost))
-    if not 0 < k < len(grid) - 1:
-        further = min(2 * reach, _FURTHEST_S)
-        return _window(a, part, further) if further > reach and np.ptp(cost) > _WINDOW_DEPTH else None
-    if min(cost[:k].max(), cost[k + 1 :].max()) - cost[k] < _WINDOW_DEPTH:
-        return None
-    extra, information = float(grid[k]), 0.0
-    for _ in range(3):
-        X = linearised(part, a.track, a.R, base + extra)[:, 3:]
-        information = float(X[:, 0] @ X[:, 0])
-        extra += float(np.clip(X[:, 0] @ X[:, 1] / max(information, 1e-300), -_WINDOW_STEP_S, _WINDOW_STEP_S))
-    middle = float(stretch.middle.mean())
-    at = float(a.shift(np.array([middle]))[0])
-    return float(stretch.t[0]), float(stretch.t[-1]), at + extra, information**-0.5
-
-
 def turned_alike(a: Alignment, parts: Sequence[Array]) -> float:
     """Return by how much chi-squared is lower with the track's turns than without: below nothing where the track has noise alone."""
-    without = sum(float(np.sum(part.clean(part.stretch.turns.angle[:, part.stretch.axes]) ** 2)) for part in a.parts)
+    without = sum(float(np.sum(part.own**2)) for part in a.parts)
     return without - sum(float(np.sum(X[:, -1] ** 2)) for X in parts)
-
-
-def turned_by(a: Alignment) -> tuple[Array, Array]:
-    """Return the whitened turns (rows,), and those that the track predicts for them."""
-    own = [part.clean(part.stretch.turns.angle[:, part.stretch.axes]) for part in a.parts]
-    other = [part.clean(part.stretch.beta(a.track, a.shift(part.stretch.t)[:, None])[:, 0] @ a.R.T) for part in a.parts]
-    return np.concatenate(own), np.concatenate(other)
 
 
 def noise_information(a: Alignment) -> float:
@@ -310,28 +224,11 @@ def epochs(a: Alignment, parts: Sequence[Array]) -> tuple[Array, Array, Array]:
     With h = H^-1 e: X h / h_tau is tau's column without what the others explain. A shorter piece would not do: the stretch's bias is
     fitted, so that its pieces scatter less than they are worth.
     """
-    H = _gram(parts)[:4, :4] + np.diag(_PRIOR)
-    free = np.arange(0 if a.free_rotation else 3, 4)
+    H = gram(parts)[:4, :4] + np.diag(PRIOR)
+    free = a.free
     h = np.zeros(4)
     h[free] = np.linalg.pinv(H[np.ix_(free, free)], hermitian=True)[:, -1]
     columns = [X[:, :4] @ h / h[3] for X in parts]
     information = np.array([u @ u for u in columns])
     score = np.array([u @ X[:, 4] for u, X in zip(columns, parts, strict=True)])
     return information[:, None, None], score[:, None], np.array([part.stretch.middle.mean() for part in a.parts])
-
-
-def axis_offsets(a: Alignment) -> tuple[Array, Array]:
-    """Return the offset of each measured axis less tau (d,) s, and their covariance (d, d) s^2, the rotation fitted anew with them.
-
-    An axis about which nothing turns has 0 +- 1 s.
-    """
-    d = len(a.R)
-    H = np.zeros((4 + d, 4 + d))
-    for part in a.parts:
-        X = linearised(part, a.track, a.R, a.shift(part.stretch.t), by_axis=True)
-        H += X.T @ X
-    H[:-1, :-1] += np.diag([*_PRIOR[:3], *np.ones(d)])
-    free = np.arange(0 if a.free_rotation else 3, 3 + d)
-    scale = 1 / np.sqrt(np.diag(H)[free])
-    cov = np.linalg.inv(H[np.ix_(free, free)] * scale[:, None] * scale) * scale[:, None] * scale
-    return (cov @ H[free, -1])[-d:], cov[-d:, -d:]

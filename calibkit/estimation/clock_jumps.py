@@ -59,6 +59,5 @@ def _place(a: Alignment, clock: Clock, i: int, bias: Array) -> Jump | None:
 
 def _squares(a: Alignment, stretch: Stretch, clock: Clock, bias: Array) -> Array:
     """Return |alpha - R beta - bias duration|^2 (n,) of every turn of a stretch, those that were given up included."""
-    turned = stretch.beta(a.track, clock.at(stretch.t)[:, None])[:, 0]
-    left = stretch.turns.angle[:, stretch.axes] - turned @ a.R.T - stretch.turns.duration[:, None] * bias
+    left = stretch.left(a.track, a.R, clock.at(stretch.t)[:, None])[:, 0] - stretch.turns.duration[:, None] * bias
     return np.asarray(np.sum(left**2, axis=1), np.float64)

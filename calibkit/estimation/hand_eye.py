@@ -66,6 +66,7 @@ class HandEyeFit:
     n_worlds: int
     converged: bool
     by_reach: bool  # an arm's turns and places contradict each other: its geometry is off, and places count less
+    robot: RobotNoise | None  # what was stated of the arm's noise
     lens: LensEffect | None  # of corners: how well the lens is known, and how X follows it
     refined: Refined
     trusted: Trust
@@ -124,6 +125,7 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None, corn
         n_worlds=data.n_worlds,
         converged=found.converged,
         by_reach=found.by_reach,
+        robot=settings.robot,
         lens=lens,
         refined=found,
         trusted=trusted,

@@ -30,8 +30,7 @@ def lines(name: str, fixed: str, fit: HandEyeFit, asked: Asked, wrong: tuple[Sus
     lines.append(f"  scatter of {fixed}, which should be one transform: {size}{each}")
     if asked.px is not None and fit.kept.any():
         lines.append(f"  the board where the robot's poses say it is, in the images: rms {plain(_rms(asked.px[fit.kept]), 3)} px")
-    how = "assumed (too few poses tell it)" if fit.noise_assumed else "as stated or told by the residuals"
-    lines.append(f"  noise, {how}: {_noise(fit)}")
+    lines.append(f"  noise, {_noise_source(fit)}: {_noise(fit)}")
     for each_wrong in wrong[:_WORST]:
         size = f"{plain(np.degrees(each_wrong.angle), 3)} deg, {plain(1e3 * each_wrong.distance, 3)} mm"
         lines.append(f"  left out: {one_line(each_wrong.label, 60)} ({size}){': ' + each_wrong.why if each_wrong.why else ''}")
@@ -95,6 +94,14 @@ def _triple(values: Array, sigmas: Array) -> str:
     return "({}) +- ({})".format(*both)
 
 
+def _noise_source(fit: HandEyeFit) -> str:
+    if fit.noise_assumed:
+        return "assumed (too few poses tell it)"
+    if fit.robot is None:
+        return "told by the residuals"
+    return "the robot's poses taken for exact" if fit.robot.exact else "the robot's as stated or, where residuals have more, theirs"
+
+
 def _noise(fit: HandEyeFit) -> str:
     """Return each side's noise, of one coordinate: a told covariance as its corners' px where there are corners."""
     one, two, _, _ = fit.data.words.frames
@@ -103,6 +110,8 @@ def _noise(fit: HandEyeFit) -> str:
     said = []
     for key, value in fit.noise.items():
         side, kind = key.split("_")
+        if side == "P" and fit.robot is not None and fit.robot.exact:
+            continue
         if kind == "rotation":
             said.append(f"{sides[side]} turned by {plain(np.degrees(value))} deg")
         elif kind == "translation":

@@ -20,7 +20,6 @@ _SETTLED = 0.2  # sigmas
 _BLOCK_S = 2.0  # residuals farther apart are taken for independent
 _DISAGREE = 4.0  # sigmas
 _WORTH_S = 1e-3
-_FAST_AND_SLOW = "fast and slow motion disagree"  # time_offset_verdict's
 
 
 def calibrate_streams(
@@ -69,7 +68,7 @@ def _one_offset(P: str, Q: str, turns: ClockOffset, whole: ClockOffset, reasons:
         f"dt_{P}_{Q}: use {milliseconds(whole.dt, whole.sigma)}, which whole poses have, places too; turns alone have "
         f"{' and '.join(others)}: a filter, blur or stamps that jitter in {P} or {Q}"
     )
-    return (*(reason for reason in reasons if fast is None or _FAST_AND_SLOW not in reason.text), Reason(Verdict.CHECK, text))
+    return (*(reason for reason in reasons if fast is None or reason != turns.doubt), Reason(Verdict.CHECK, text))
 
 
 def offset_left(pairing: Pairing, fit: HandEyeFit) -> tuple[float, float, Array]:

@@ -19,6 +19,8 @@ _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
 _FEW_ENOUGH = 200  # poses, to name those that are wrong
 _NAMED = 4
 _OFF, _OFF_SIGMAS = 3e-3, 10.0  # m or sigmas that lengths of another scale may move p by, with a CHECK
+_NOT_EXACT = 3.0  # times the corners' noise
+_COARSER = 1.5  # times the stated noise: 20 poses tell it to a fifth
 _ANCHORS = ("park", "horaud", "daniilidis")  # that fail together only where something is wrong
 
 
@@ -115,7 +117,7 @@ def _poses(fit: HandEyeFit, wrong: tuple[Suspect, ...]) -> list[tuple[Verdict, s
 
 
 def _about(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
-    out = []
+    out = _stated(fit)
     if fit.lag is not None:
         text = (
             f"residuals grow with speed as if the second side were {1e3 * fit.lag.dt:+.3g} +- {1e3 * fit.lag.sigma:.2g} ms off "
@@ -126,4 +128,20 @@ def _about(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
     if anchors and all(m.failed for m in anchors) and not any(o.grade == "not observable" for o in fit.open):
         text = "no closed form agrees with the refined X: look at the residuals before you believe either"
         out.append((Verdict.CHECK, text))
+    return out
+
+
+def _stated(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
+    """Return where the residuals have more noise than was stated of the robot."""
+    robot, out = fit.robot, []
+    if robot is None:
+        return []
+    if robot.exact:
+        off = fit.noise.get("Q_factor", 0.0)
+        text = f"with exact robot poses the corners are off by {off:.2g} times their noise: this robot's poses are not exact"
+        return [(Verdict.CHECK, f"{text}; leave out --robot-noise exact")] if off > _NOT_EXACT else []
+    for sigma, kind, what in ((robot.rotation, "P_rotation", "turns"), (robot.translation, "P_translation", "places")):
+        if fit.noise.get(kind, 0.0) > _COARSER * sigma:
+            text = f"the robot's {what} err by {fit.noise[kind] / sigma:.2g} times what --robot-noise states, which is taken instead"
+            out.append((Verdict.CHECK, f"{text}: a repeatability is not the accuracy of an arm's geometry"))
     return out

@@ -1,6 +1,5 @@
 """How far the clocks of two pose streams are apart: as given, by how both turn, or none where they share one clock."""
 
-import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +40,7 @@ class ClockOffset:
     sigma: float
     known: str  # "given", "assumed", "turns" or, by the fit of X too, "poses"
     fit: TimeOffsetFit | None = None  # of the slower stream's turns to the faster one
+    doubt: Reason | None = None  # that fast and slow turns tell different ones
 
     def on_fast(self, t_ns: Times, read_P: bool) -> Times:
         """Return the slower stream's stamps on the faster one's clock, P's where `read_P`."""
@@ -124,15 +124,12 @@ def offset_by_turns(
     except BadInputError as error:
         why = str(error)
     else:
-        judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns) for each in (P, Q)})
+        judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns, "pose") for each in (P, Q)})
         if judged.status is not Status.NOT_OBSERVABLE or (judged.coarse and fit.sigma < _COARSE_S):
-            offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit)
-            return (
-                offset,
-                [],
-                tuple(reason for reason in judged.reasons if not re.match(f"{re.escape(name)}: (weak|not observable):", reason.text)),
-            )
-        why, reasons = judged.reasons[0].text.removeprefix(f"{name}: not observable: "), judged.reasons[1:]
+            offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit, judged.fast)
+            return offset, [], tuple(reason for reason in judged.reasons if reason is not judged.size)
+        assert judged.size is not None
+        why, reasons = judged.size.text.removeprefix(f"{name}: not observable: "), judged.others
     if not one_clock:
         raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}; or give {name} in a rig file")
     return ClockOffset(0.0, 0.0, "assumed"), [f"the poses do not tell the offset of {P.name} and {Q.name}: {why}"], reasons

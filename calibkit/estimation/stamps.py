@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.plural import counted
+from calibkit.data.plural import counted, plain
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -211,7 +211,7 @@ def describe(report: StampReport, from_share: float = 0.0, from_jitter_s: float 
     said, noun = [], report.noun
     rate = f", the rate is {report.rate_hz:.4g} Hz" if report.rate_hz else ""
     if report.missing and report.missing_share >= from_share:
-        said.append(f"{_plain(100 * report.missing_share, 3)} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
+        said.append(f"{plain(100 * report.missing_share, 3)} % of the {noun}s are missing ({report.missing} of {report.expected}){rate}")
     if report.duplicates:
         said.append(f"{counted(report.duplicates, f'{noun} has', f'{noun}s have')} the stamp of another")
     if report.zeros:
@@ -221,21 +221,16 @@ def describe(report: StampReport, from_share: float = 0.0, from_jitter_s: float 
     if report.backward:
         said.append(f"{counted(report.backward, 'stamp goes', 'stamps go')} back in time")
     if report.period_s and report.jitter_s and report.jitter_sigma_s and report.jitter_s > max(_TOLD * report.period_s, from_jitter_s):
-        size = f"{_plain(report.jitter_s * 1e3, 2)} +- {_plain(report.jitter_sigma_s * 1e3, 1)}"
+        size = f"{plain(report.jitter_s * 1e3, 2)} +- {plain(report.jitter_sigma_s * 1e3, 1)}"
         said.append(f"stamps jitter by {size} ms rms around a regular grid{rate if not report.missing else ''}")
     if report.bursts:
         said.append("stamps come in bursts: they are times of arrival, not of the sensor")
     return said
 
 
-def _plain(value: float, digits: int) -> str:
-    """Return a number without an exponent: 150 of 2 digits, not 1.5e+02."""
-    return f"{float(f'{value:.{digits}g}'):g}"
-
-
 def _long(seconds: float) -> str:
     """Return a duration in the largest unit that it fills."""
     for unit, size in (("years", 365.25 * 86400), ("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= size:
-            return f"{_plain(seconds / size, 3)} {unit}"
-    return f"{_plain(seconds, 3)} s"
+            return f"{plain(seconds / size, 3)} {unit}"
+    return f"{plain(seconds, 3)} s"

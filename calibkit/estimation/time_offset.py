@@ -13,45 +13,38 @@ from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError
 from calibkit.estimation.alignment import (
     Alignment,
-    Windows,
     columns,
-    epochs,
     newton,
     noise_information,
     settle,
     stepped,
     sweep,
     turned_alike,
-    window_offsets,
 )
-from calibkit.estimation.clock import Clock, fit_clock
-from calibkit.estimation.clock_jumps import placed
+from calibkit.estimation.clock import Clock
+from calibkit.estimation.clock_windows import Windows
+from calibkit.estimation.moving_clock import with_clock
 from calibkit.estimation.orientation_track import OrientationTrack, track_of_gyro, track_of_poses
 from calibkit.estimation.slow_turns import by_slow_turns, joined_up, turns_in_long_one
 from calibkit.estimation.stamps import come_in_bursts
+from calibkit.estimation.time_offset_sigma import covariance_of, inflation, interval, sigma_of
 from calibkit.estimation.time_offset_start import Start, find_starts
-from calibkit.estimation.turn_comparison import lost_to_gaps, raw_residuals, split, usable, why_so_few
+from calibkit.estimation.turn_comparison import FEWEST_TURNS, lost_to_gaps, raw_residuals, split, usable, why_so_few
 from calibkit.estimation.turn_noise import NoiseLevels
 from calibkit.estimation.turns import Turns
 from calibkit.geometry.so3 import Array
-from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
+from calibkit.solver.trust import SCALES, Covariance
 
 _MAX_REACH_S = 0.8
 _MARGIN_S = 0.01
 _BIAS = 1e-2  # rad/s; a larger bias is taken out of a gyroscope's track, whose turns it bends: by 1e-5 rad in 50 ms at 4 rad/s
-_FEWEST = 20  # turns
-_CHI2_95 = 3.841
 _RIVAL = 10.83  # chi-squared of 1 in 1000: a bottom that is no more than this higher may be the true one
 _RIVAL_SHARE = 0.5  # of the stretches must be known at both lags
 _AS_LOW = 4.0  # chi-squared; the grid's own step is no reason to look again
 _AGAIN = 2
 _APART_S = 0.02  # what two starts lead to within is one bottom
-_PROFILE = 41
-_LEAST_SHARE = 1e-6  # of the information that is taken for real
 _CONTRADICTED = 12.25  # chi-squared of one degree of freedom: 3.5 sigma
 _TURNING, _OTHER_UNIT = 0.1, 0.4  # rad/s; of the logarithm
-_FEW_WINDOWS = 12
-_CLOCKS = 4  # times that a clock is looked at
 
 
 @dataclass(frozen=True)
@@ -95,21 +88,15 @@ class TimeOffsetFit:
 
     @property
     def sigma(self) -> float:
-        """Return one standard deviation, correlated residuals, noise in the reference's rates and a clock's jumps paid for."""
-        of_tau = float(np.sqrt(self.covariance.corrected[0, 0] / max(1 - self.noise_share, _LEAST_SHARE)))
-        return max(of_tau, self.clock.sigma_s) if self.clock is not None and self.clock.jumps else of_tau
+        """Return one standard deviation, all that `sigma_of` names paid for."""
+        return sigma_of(self.alignment, self.covariance, self.noise_share)
 
     @property
     def depth(self) -> float:
         """How far the V's bottom lies below the lower of its two sides, as chi-squared with correlated residuals paid for."""
         k = int(np.argmin(self.cost))
         sides = (self.cost[: k + 1].max(), self.cost[k:].max())
-        return float(min(sides) - self.cost[k]) / _inflation(self.covariance)
-
-
-def _inflation(covariance: Covariance) -> float:
-    """Return what chi-squared is too large by, for residuals that are larger or more correlated than their model."""
-    return covariance.variance_factor * max(1.0, float(covariance.factors[0])) ** 2
+        return float(min(sides) - self.cost[k]) / inflation(self.covariance)
 
 
 def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress = silent) -> TimeOffsetFit:
@@ -129,7 +116,7 @@ def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings:
 def _contradicts(fit: TimeOffsetFit, slow: Alignment) -> bool:
     """Whether long turns tell another offset, by Hausman's test with half their variance at least: chance may bring it below."""
     apart, parts = stepped(slow, columns(slow))
-    variance = float(_covariance(slow, parts).corrected[0, 0])
+    variance = float(covariance_of(slow, parts).corrected[0, 0])
     return apart**2 > _CONTRADICTED * max(variance - fit.sigma**2, variance / 2) and abs(apart) > SCALES["s"]
 
 
@@ -146,7 +133,7 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
     bias, taken_out = _bias(a), np.zeros(3)
     if isinstance(reference, ImuSamples) and np.linalg.norm(bias) > _BIAS:
         a, taken_out = newton(replace(a, track=track_of_gyro(reference, bias))), bias
-    a, windows = _with_clock(a, settings, reach)
+    a, windows = with_clock(a, settings.levels, reach)
     again = 0
     while True:
         tau = _grid(a, settings.step_s, reach)
@@ -161,16 +148,16 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
                 break
             reach = min(2 * reach, _MAX_REACH_S)
         a = replace(_begin(turns, a.track, start, settings, reach), R=a.R, tau=float(tau[k]), clock=a.clock)
-        a, windows = _with_clock(settle(a, settings.levels), settings, reach)
+        a, windows = with_clock(settle(a, settings.levels), settings.levels, reach)
     parts = columns(a)
-    covariance = _covariance(a, parts)
+    covariance = covariance_of(a, parts)
     noise_share = min(noise_information(a) * float(covariance.plain[0, 0]) / covariance.variance_factor, 1.0)
     fit = TimeOffsetFit(
         alignment=a,
         start=start,
         coarse_ns=start.coarse_ns,
         covariance=covariance,
-        interval=_interval(a, covariance, noise_share),
+        interval=interval(a, covariance, noise_share),
         tau=tau,
         cost=cost,
         second=None,
@@ -178,11 +165,11 @@ def _fit(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, 
         clock=a.clock,
         gyro_bias=taken_out + _bias(a),
         n_turns=sum(len(stretch.turns.first) for stretch in a.stretches),
-        gain=turned_alike(a, parts) / _inflation(covariance),
+        gain=turned_alike(a, parts) / inflation(covariance),
         noise_share=noise_share,
         lost=lost_to_gaps(replace(turns, t_ns=turns.t_ns + start.coarse_ns), a.track, -reach - _MARGIN_S, reach + _MARGIN_S),
     )
-    return replace(fit, second=_second(fit, starts[1:]), interval=_with_jumps(fit))
+    return replace(fit, second=_second(fit, starts[1:]))
 
 
 def _refuse_other_unit(turns: Turns, track: OrientationTrack) -> None:
@@ -198,7 +185,7 @@ def _refuse_other_unit(turns: Turns, track: OrientationTrack) -> None:
 def bootstrap_sigma(fit: TimeOffsetFit, draws: int, seed: int = 0) -> float:
     """Return the standard deviation of the offset over draws of the stretches with replacement, one Gauss-Newton step each."""
     grams = np.stack([X.T @ X for X in columns(fit.alignment)])
-    free = np.arange(0 if fit.alignment.free_rotation else 3, 4)
+    free = fit.alignment.free
     drawn = np.random.default_rng(seed).multinomial(len(grams), np.full(len(grams), 1 / len(grams)), draws)
     total = np.einsum("db,bij->dij", drawn, grams)
     A = total[:, free[:, None], free] + 1e-9 * np.trace(total[0]) / 5 * np.eye(len(free))
@@ -209,7 +196,7 @@ def bootstrap_sigma(fit: TimeOffsetFit, draws: int, seed: int = 0) -> float:
 def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settings, reach: float) -> Alignment:
     whole = replace(turns, t_ns=turns.t_ns + start.coarse_ns)
     keep = usable(whole, track, -reach - _MARGIN_S, reach + _MARGIN_S)
-    if keep.sum() < _FEWEST:
+    if keep.sum() < FEWEST_TURNS:
         raise BadInputError(why_so_few(turns, track, reach))
     stretches = split(whole.select(keep), track.origin_ns, settings.free_bias)
     return Alignment(
@@ -225,44 +212,6 @@ def _begin(turns: Turns, track: OrientationTrack, start: Start, settings: Settin
     )
 
 
-def _with_clock(a: Alignment, settings: Settings, reach: float) -> tuple[Alignment, Windows]:
-    """Return the alignment with the drift and the jumps that its windows show, and the windows.
-
-    What a moving clock leaves is noise to a constant one, so that outliers and levels are found anew with it, and once more if it
-    changes by more than a window knows.
-    """
-    windows = window_offsets(a, reach)
-    for _ in range(_CLOCKS):
-        if not len(windows.tau):
-            break
-        middle = (windows.start + windows.stop) / 2
-        clock = placed(a, _clock_of(a, windows, reach))
-        if clock.kind == "constant" and (a.clock is None or a.clock.kind == "constant"):
-            return replace(a, clock=clock), windows
-        change = np.abs(clock.at(middle) - a.shift(middle))
-        a = replace(a, clock=clock, tau=clock.offset_s)
-        if float(change.max()) < float(np.median(windows.sigma)):
-            return newton(a), windows
-        a = settle(a, settings.levels)
-        windows = window_offsets(a, reach)
-    return a, windows
-
-
-def _clock_of(a: Alignment, windows: Windows, reach: float) -> Clock:
-    """Return the clock of the windows; where few of them drift, that of their halves if those jump.
-
-    A jump inside one of a few windows, which then has an offset between the two, looks like a drift.
-    """
-    clock = fit_clock((windows.start + windows.stop) / 2, windows.start, windows.stop, windows.tau, windows.sigma)
-    if clock.kind != "drifting" or len(windows.tau) >= _FEW_WINDOWS:
-        return clock
-    halves = window_offsets(a, reach, halved=True)
-    if len(halves.tau) <= len(windows.tau):
-        return clock
-    finer = fit_clock((halves.start + halves.stop) / 2, halves.start, halves.stop, halves.tau, halves.sigma)
-    return finer if finer.jumps else clock
-
-
 def _grid(a: Alignment, step: float, reach: float) -> Array:
     """Return the offsets (k,) of the V: around the start, or where a clock that moves has left that, around its reference time's."""
     moves = a.clock is not None and a.clock.kind != "constant"
@@ -276,50 +225,9 @@ def _bias(a: Alignment) -> Array:
     return np.asarray(-a.R.T @ np.mean(found, axis=0), np.float64) if found and len(a.R) == 3 else np.zeros(3)
 
 
-def _covariance(a: Alignment, parts: Sequence[Array]) -> Covariance:
-    """Return the covariance (1, 1) of tau."""
-    S, g, t = epochs(a, parts)
-    rows = sum(len(X) for X in parts)
-    unknowns = 1 + 3 * a.free_rotation + sum(part.bias.shape[1] for part in a.parts)
-    factor = sum(float(X[:, -1] @ X[:, -1]) for X in parts) / max(1, rows - unknowns)
-    return covariance_in_time(S, g, t, factor, np.array([SCALES["s"]]))
-
-
-def _interval(a: Alignment, covariance: Covariance, noise_share: float) -> tuple[float, float]:
-    """Return the 95 % interval of tau: where the V has risen by chi-squared's 3.84, correlation and noise in the rates paid for."""
-    inflation = _inflation(covariance) / max(1 - noise_share, _LEAST_SHARE)
-    rise, middle = _CHI2_95 * inflation, a.tau
-    width = 4 * float(np.sqrt(covariance.plain[0, 0] * inflation / covariance.variance_factor))
-    tau = middle + np.linspace(-width, width, _PROFILE)
-    above = sweep(a, tau)
-    above = above - above.min() - rise
-    centre = int(np.argmin(above))
-    return (_crossing(tau, above, centre, -1), _crossing(tau, above, centre, 1))
-
-
-def _with_jumps(fit: TimeOffsetFit) -> tuple[float, float]:
-    """Return the interval as much wider as a clock's jumps, whose sizes the V takes for known, make sigma."""
-    if fit.clock is None or not fit.clock.jumps:
-        return fit.interval
-    tau = fit.alignment.tau
-    wider = fit.sigma / replace(fit, clock=None).sigma
-    low, high = (tau + wider * (end - tau) for end in fit.interval)
-    return low, high
-
-
-def _crossing(x: Array, y: Array, start: int, step: int) -> float:
-    """Return where y rises through 0 from x[start] on, the end where it does not."""
-    k = start
-    while 0 <= k + step < len(x) and y[k + step] < 0:
-        k += step
-    if not 0 <= k + step < len(x):
-        return float(x[k])
-    return float(x[k] + (x[k + step] - x[k]) * -y[k] / (y[k + step] - y[k]))
-
-
 def _second(fit: TimeOffsetFit, others: Sequence[Start]) -> float | None:
     """Return another offset that the turns may as well have: a bottom of the V, or another peak of the correlation."""
-    allowed = _RIVAL * _inflation(fit.covariance)
+    allowed = _RIVAL * inflation(fit.covariance)
     k = int(np.argmin(fit.cost))
     lows = 1 + np.flatnonzero((fit.cost[1:-1] < fit.cost[:-2]) & (fit.cost[1:-1] <= fit.cost[2:]))
     for low in lows[np.argsort(fit.cost[lows])]:

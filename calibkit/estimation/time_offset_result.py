@@ -8,12 +8,14 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import find_transform, make_time_offset
 from calibkit.data.verdict import Reason, Status, Verdict, worst
-from calibkit.estimation.alignment import Alignment, open_axes
+from calibkit.estimation.alignment import Alignment
+from calibkit.estimation.alignment_axes import open_axes
 from calibkit.estimation.clock import describe
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.estimation.time_offset_delay import Delays
-from calibkit.estimation.time_offset_verdict import by_axis, judge_time_offset, rates
+from calibkit.estimation.time_offset_doubts import by_axis
+from calibkit.estimation.time_offset_verdict import judge_time_offset, rates
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.rough_offset import Candidate, rough_offsets
-from calibkit.estimation.turn_comparison import Stretch, usable
+from calibkit.estimation.turn_comparison import FEWEST_TURNS, Stretch, usable
 from calibkit.estimation.turns import Turns
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -15,7 +15,6 @@ from calibkit.geometry.so3 import Array
 _STEP_S = 0.005
 _LONGEST_S = 120.0  # of the liveliest part: a clock may drift through a longer one
 _MOST_TURNS = 4000
-_FEWEST = 20
 _REACH_S = 0.05
 
 
@@ -89,7 +88,7 @@ def _rotations(cross: Array, beta: Array, w: Array) -> Array:
 
 def _liveliest(turns: Turns, keep: NDArray[np.bool_]) -> Turns | None:
     """Return at most 120 s of the usable turns in which the rate changes most, thinned to some thousands."""
-    if keep.sum() < _FEWEST:
+    if keep.sum() < FEWEST_TURNS:
         return None
     part = turns.select(keep)
     t = (part.t_ns[part.first] - part.t_ns[part.first[0]]) * 1e-9

@@ -21,7 +21,7 @@ from calibkit.geometry.so3 import Array
 
 STRETCH_S = 5.0
 LEAST_TURNS = 8  # in a stretch
-_FEW_TURNS = 20
+FEWEST_TURNS = 20  # that can be compared
 _UNEVEN = 0.5  # of the time the track must be known for as long as a turn takes
 TILT = 0.5  # rad; what a rotation that nothing tells may be off by: keeps its elimination finite
 
@@ -63,6 +63,10 @@ class Stretch:
         q = track.orientation(self.t[:, None] + shift)
         return so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q[self.turns.first]), q[self.turns.last]))
 
+    def left(self, track: OrientationTrack, R: Array, shift: Array) -> Array:
+        """Return alpha - R beta (n, k, d) rad for stamps shifted by `shift` (m, k) s."""
+        return np.asarray(self.turns.angle[:, None, self.axes] - self.beta(track, shift) @ R.T, np.float64)
+
     def noise(self, track: OrientationTrack, R: Array, shift: Array, shape: Array) -> TurnNoise:
         """Return the noise of its turns, its sensor turning at R omega."""
         omega = np.zeros((len(self.t), 3))
@@ -78,6 +82,11 @@ class Weighed:
     whiten: Whitener
     bias: Array  # (rows, d) orthonormal: what the whitened bias spans
     root: Array  # (d, d): bias @ root is the whitened bias
+
+    @property
+    def own(self) -> Array:
+        """Return its turns (rows,), clean."""
+        return self.clean(self.stretch.turns.angle[:, self.stretch.axes])
 
     def clean(self, x: Array) -> Array:
         """Return whitened columns for x (n, d, ...), as (rows, ...), with the bias taken out."""
@@ -111,8 +120,7 @@ def weigh(stretch: Stretch, noise: TurnNoise, levels: NoiseLevels) -> Weighed:
 
 def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> tuple[Array, Array]:
     """Return alpha - R beta - c duration (n, d) rad at one shift (m,), and the bias c (d,) rad/s."""
-    turned = part.stretch.beta(track, shift[:, None])
-    left = _left(part.stretch, turned, R)[:, 0]
+    left = part.stretch.left(track, R, shift[:, None])[:, 0]
     if not len(part.root):
         return left, np.zeros(left.shape[1])
     c = np.linalg.solve(part.root, part.bias.T @ part.whiten(left.reshape(-1, 1)))[:, 0]
@@ -121,13 +129,7 @@ def raw_residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array
 
 def residuals(part: Weighed, track: OrientationTrack, R: Array, shift: Array) -> Array:
     """Return whitened residuals (rows, k) for shifts (m, k)."""
-    turned = part.stretch.beta(track, shift)
-    return part.clean(_left(part.stretch, turned, R).swapaxes(1, 2))
-
-
-def _left(stretch: Stretch, turned: Array, R: Array) -> Array:
-    """Return alpha - R beta (n, k, d)."""
-    return np.asarray(stretch.turns.angle[:, None, stretch.axes] - turned @ R.T, np.float64)
+    return part.clean(part.stretch.left(track, R, shift).swapaxes(1, 2))
 
 
 def linearised(part: Weighed, track: OrientationTrack, R: Array, shift: Array, by_axis: bool = False) -> Array:
@@ -169,7 +171,7 @@ def lost_to_gaps(turns: Turns, track: OrientationTrack, low: float, high: float)
 
 def why_so_few(turns: Turns, track: OrientationTrack, reach: float) -> str:
     """Say why hardly a turn can be compared, at whatever offset."""
-    if (many := len(turns.first)) < _FEW_TURNS <= len(turns.t_ns):
+    if (many := len(turns.first)) < FEWEST_TURNS <= len(turns.t_ns):
         return (
             f"only {counted(many, 'turn')} of the first could be told from its {len(turns.t_ns)} stamps: "
             "poses that come steadily are needed; "

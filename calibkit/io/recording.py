@@ -54,6 +54,15 @@ class Recording:
         """What was salvaged, left out or replaced so far; complete once the topics have been read."""
         return list(dict.fromkeys(one_line(warning, 1000) for source in self._sources for warning in source.warnings))
 
+    @property
+    def recorded(self) -> dict[str, int]:
+        """How many stamps of a topic are times of recording, its header having none; complete once the topics have been read."""
+        found: dict[str, int] = {}
+        for source in self._sources:
+            for topic, many in source.recorded.items():
+                found[topic] = found.get(topic, 0) + many
+        return found
+
     def choose(self, kind: str, asked: str | None = None) -> str:
         """Return the topic of a kind: the one asked for, or the only one; BadInputError lists the candidates."""
         candidates = [topic.name for topic in self.topics if topic.kind == kind]

@@ -155,6 +155,7 @@ class _Bag:
 
     def _warn_of_zeros(self, topic: str, zeros: int) -> None:
         if zeros:
+            self.source.recorded[topic] = zeros
             self.source.warn(f"{topic}: {zeros} header stamps are zero: record times are used for them")
 
 

@@ -109,6 +109,7 @@ class Source:
     edges: Callable[[], dict[tuple[str, str], Edge]] | None = None
     survey: Callable[[Progress, Mapping[str, Look]], dict[str, Stamps]] | None = None
     warnings: list[str] = field(default_factory=list)
+    recorded: dict[str, int] = field(default_factory=dict)  # header stamps of a topic that are zero: record times stand in for them
 
     def warn(self, text: str) -> None:
         """Note once what a reader of the result must know."""

@@ -20,9 +20,7 @@ from calibkit.models.cameras import CAMERAS
 from calibkit.solver.trust import grade
 from calibkit.stages.handeye_sides import Options, Sides
 
-_COARSER = 1.5  # times the stated noise: 20 poses tell it to a fifth
 AUTO, EXACT = "auto", "exact"
-_NOT_EXACT = 3.0  # times the corners' noise
 _CHANCE = 1e-3  # of lenses that have not moved are told to have
 
 
@@ -77,23 +75,12 @@ def how(fit: HandEyeFit) -> list[str]:
 
 def with_images(result: Result, fit: HandEyeFit, sides: Sides, options: Options) -> Result:
     """Return the result with what refining in the images has shown, and the camera's entry where the lens was free, as asked for."""
-    found, robot, reasons = fit.refined.corners, robot_noise(options.robot_noise), list(result.reasons)
+    found = fit.refined.corners
     facts: dict[str, object] = {"robot_noise": options.robot_noise, "by_reach": fit.by_reach, "in_images": found is not None}
     if found is not None:
         used, rms = int(np.sum(found.grid.weight > 0)), found.rms(fit.refined.M)[0]
         facts |= {"corners": used, "rms_px": rms, "free_intrinsics": found.free}
-    noise = fit.noise.get("Q_factor", 0.0)
-    if robot is not None and robot.exact and noise > _NOT_EXACT:
-        text = f"with exact robot poses the corners are off by {noise:.2g} times their noise: this robot's poses are not exact"
-        reasons.append(Reason(Verdict.CHECK, f"{text}; leave out --robot-noise exact"))
-    stated = (
-        () if robot is None or robot.exact else ((robot.rotation, "P_rotation", "turns"), (robot.translation, "P_translation", "places"))
-    )
-    for sigma, kind, what in stated:
-        if fit.noise.get(kind, 0.0) > _COARSER * sigma:
-            text = f"the robot's {what} err by {fit.noise[kind] / sigma:.2g} times what --robot-noise states, which is taken instead"
-            reasons.append(Reason(Verdict.CHECK, f"{text}: a repeatability is not the accuracy of an arm's geometry"))
-    result = replace(result, reasons=tuple(reasons), facts={**result.facts, "refinement": facts})
+    result = replace(result, facts={**result.facts, "refinement": facts})
     if found is None or not found.free or fit.lens is None or sides.board is None:
         return result
     return _with_free_lens(result, fit, found, fit.lens, sides.board.views.camera, sides.board.camera)

@@ -27,7 +27,7 @@ from calibkit.stages.sensors import Sensor, choose_pair, find_sensors
 
 _DEFAULT = ImuOptions()
 _NO_DELAYS = Delays()
-_RECORD_TIMES = "record times are used"
+_RECORDED = "are zero in the header and times of recording are used for them: td holds how late those are"
 _STAMPED = {"image": "frame", "corners": "frame", "pose": "pose", "tf": "pose"}  # what has a stamp
 _FEWEST_DRAWN = 9  # stretches; the spread over draws of fewer says more of chance than of td
 
@@ -88,8 +88,11 @@ def time_offset(
         warnings.append(
             f"--bootstrap: {there} of 5 s are too few to draw from, {_FEWEST_DRAWN} are needed: record {5 * _FEWEST_DRAWN} s or more"
         )
-    recorders = [text for text in recording.warnings if _RECORD_TIMES in text]  # no times of the sensor: td is the recorder's delay, too
-    doubts = [Reason(Verdict.CHECK, f"dt_{to.name}_{of.name}: {text}, so it holds how late they were recorded") for text in recorders]
+    doubts = [
+        Reason(Verdict.CHECK, f"dt_{to.name}_{of.name}: {counted(many, 'stamp')} of {sensor.name} {_RECORDED}")
+        for sensor in (of, to)
+        if (many := recording.recorded.get(sensor.topic))
+    ]
     result = replace(result, reasons=(*result.reasons, *doubts), facts={**result.facts, "warnings": warnings})
     read = [*outputs.rigs, *([options.target] if options.target else [])]  # the lens, and the board
     inputs = [*recording.inputs(), *((path.name, sha256(path.read_bytes()).hexdigest()) for path in read)]

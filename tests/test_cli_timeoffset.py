@@ -435,7 +435,7 @@ def test_bootstrap(run: Run, imu_file: Path, pose_file: Path, tmp_path: Path) ->
     assert drawn
     sigma = offset(tmp_path / "rig.yaml", "dt_imu0_pose0").sigma
     assert sigma is not None
-    assert float(drawn[1]) * 1e-3 == pytest.approx(sigma, rel=0.6)
+    assert float(drawn[1]) * 1e-3 == pytest.approx(sigma, rel=0.5)  # two sigmas: the spread of 9 stretches is itself known to 24 %
     few = run("timeoffset", imu_file, pose_file, "--bootstrap", 200)
     assert few.code == 0
     assert "bootstrap" not in few.out
@@ -476,6 +476,7 @@ def test_a_recording_that_does_not_turn_gives_no_number(run: Run, tmp_path: Path
     facts = json.loads(js.read_text())["facts"]["timeoffset"]
     assert facts["time_offset"] == {"dt_imu0_cam0": {"method": "poses of the board"}}
     assert "signal " not in said.out  # of what is not known
+    assert said.out.count("FAIL  ") == 1  # one fault is told once
     assert set(facts["v"]["dt_imu0_cam0"].values()) == {None}
     assert json.loads(js.read_text())["not_observable"] == ["dt_imu0_cam0.offset"]
     assert run("report", out).code == 1
@@ -535,6 +536,10 @@ def test_an_option_that_cannot_count_is_refused(run: Run, imu_file: Path, pose_f
 def test_recordings_that_cannot_be_used_are_one_line(run: Run, body: Trajectory, imu_file: Path, pose_file: Path, tmp_path: Path) -> None:
     later = write_poses(tmp_path / "later.csv", seen_poses(body, stamps(30, 0.5, 1.0), 1e-3, np.random.default_rng(1)))
     assert "share too little time" in run("timeoffset", imu_file, later).mistake
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes((SAMPLES / "cam_imu.bag").read_bytes()[:300_000])
+    lens = ("--rig", SAMPLES / "truth.yaml", "--target", SAMPLES / "target.yaml")
+    assert re.search("share too little time.*cut.bag is damaged", run("timeoffset", cut, *lens).mistake)
     none = tmp_path / "accel.csv"
     table(none, "t [ns],ax,ay,az", stamps(100, 5.0), np.random.default_rng(0).standard_normal((500, 3)))
     assert "accel) has no gyroscope" in run("timeoffset", none, pose_file).mistake

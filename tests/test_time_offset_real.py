@@ -7,9 +7,12 @@ import pytest
 from test_board_poses import given
 from test_intrinsics_real import EUROC, EUROC_SIZE, board_views
 
+from calibkit.data.verdict import Status
 from calibkit.estimation.board_poses import board_poses
 from calibkit.estimation.board_turns import turns_of_board
+from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset import Settings, fit_time_offset
+from calibkit.estimation.time_offset_verdict import judge_time_offset
 from calibkit.estimation.turns import Turns, turns_of_poses
 from calibkit.io.recording import open_recording
 from calibkit.models.cameras import CAMERAS
@@ -48,3 +51,11 @@ def test_motion_capture_whose_fast_motion_is_not_the_cameras(data_dir: Path, par
     assert fit.by_fast_turns[0] == pytest.approx(0.031, abs=0.002)  # what other methods came to
     assert 0.017 - 2 * fit.sigma < fit.td < 0.021 + 2 * fit.sigma  # the folder's figures
     assert fit.sigma < 0.006
+
+
+def test_two_recordings_that_have_nothing_in_common(data_dir: Path) -> None:
+    phone, hand = (open_recording([data_dir / f"pose_streams/{name}.csv"]).poses(name) for name in ("tango_MARS", "vicon_hand"))
+    fit = fit_time_offset(turns_of_poses(phone), hand, Settings())
+    judged = judge_time_offset("dt_hand_phone", "phone", "hand", fit, {"phone": check_stamps(phone.t_ns), "hand": check_stamps(hand.t_ns)})
+    assert judged.status is Status.NOT_OBSERVABLE
+    assert "of the turns is not common to phone and hand: are both on one rigid body, in one recording?" in judged.reasons[0].text

@@ -53,6 +53,9 @@ def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: d
     coarse = not why and known is Status.NOT_OBSERVABLE
     if coarse:
         why = f"its sigma would be {fit.sigma * 1e3:.2g} ms; {_advice(fit)}"
+        if (share := unlike(fit)) > _UNLIKE:
+            apart = f"{100 * share:.0f} % of the turns is not common to {of} and {to}"
+            why = f"{apart}: are both on one rigid body, in one recording? If so, {why}"
     if why:
         wrong = [text for verdict, text in sizes if verdict is Verdict.FAIL]  # what makes a fit bad is the reason, and no lack of motion
         size = Reason(Verdict.FAIL, f"{name}: not observable: {wrong[0] if wrong else why}")
@@ -162,7 +165,7 @@ def _doubts(of: str, to: str, fit: TimeOffsetFit, frame_hz: float | None) -> lis
     found += [(Verdict.FAIL, text) for text in contrary(of, to, fit)]
     factor = float(fit.covariance.factors[0]) * float(np.sqrt(fit.covariance.variance_factor))
     if factor > _WORSE:
-        text = f"it wanders by more than its noise within the recording (sigma {factor:.1f} times that of independent residuals, paid for)"
+        text = f"it wanders within the recording by more than noise explains: its sigma is {factor:.1f} times that of independent residuals"
         found.append((Verdict.CHECK, text))
     found += [(Verdict.CHECK, text) for text in axes_apart(of, fit)]
     return found

@@ -132,7 +132,7 @@ def rig_reasons(rig: Rig, known: tuple[Reason, ...]) -> tuple[Reason, ...]:
             out.append(Reason(entry.verdict, f"{part}: its stage judged it {entry.verdict.value}"))
     gone: dict[str, list[str]] = {}
     for row in rows(rig):
-        whole = row.part in rig.transforms  # whose reasons name directions
+        whole = row.part in rig.transforms or row.part in rig.time_offsets  # reasons name directions, or the one parameter there is
         said = any("not observable" in text and text.startswith(f"{row.part}:") and (whole or row.name in text) for text in heard)
         if row.status is Status.NOT_OBSERVABLE and not said:
             gone.setdefault(row.part, []).append(row.name)

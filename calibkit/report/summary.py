@@ -60,7 +60,8 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
 
 def _says(reason: Reason, name: str) -> bool:
     """Whether a reason names this parameter (`cam0.fx`, `T_cam1_cam0`) as not observable."""
-    return "not observable" in reason.text and all(re.search(rf"\b{re.escape(part)}\b", reason.text) for part in name.split("."))
+    words = name.removesuffix(".offset").split(".")  # a time offset's only parameter
+    return "not observable" in reason.text and all(re.search(rf"\b{re.escape(word)}\b", reason.text) for word in words)
 
 
 def text(summary: Summary) -> str:

@@ -77,7 +77,8 @@ def time_offset(
         settings = Settings(options.reach_s, options.step_s, rotation)
         fit = fit_time_offset(turns, seen_to.samples, settings, progress)
     except BadInputError as error:
-        raise BadInputError(f"{recording.name}: {of.name} and {to.name}: {error}") from None
+        damaged = "".join(f" ({text})" for text in recording.warnings)  # what was not read may be why
+        raise BadInputError(f"{recording.name}: {of.name} and {to.name}: {error}{damaged}") from None
     few = len(fit.alignment.parts) < _FEWEST_DRAWN
     spread = bootstrap_sigma(fit, options.bootstrap) if options.bootstrap and not few else None
     stamps = {sensor.name: check_stamps(seen.t_ns, _STAMPED.get(sensor.kind, "sample")) for sensor, seen in ((of, seen_of), (to, seen_to))}

@@ -40,8 +40,11 @@ class Method:
 
 def fixed_transforms(data: HandEyeData, X: Array, kept: Mask) -> Array:
     """Return the mean (n_worlds, 4, 4) of P_i X Q_i^-1 over kept poses, identity in a world without."""
-    sums = np.zeros((data.n_worlds, 4, 4))
-    np.add.at(sums, data.world[kept], (data.P @ X @ se3.inverse(data.Q))[kept])
+    return _means(data, data.P @ X @ se3.inverse(data.Q), kept)
+
+
+def _means(data: HandEyeData, each: Array, kept: Mask) -> Array:
+    sums = data.sum_by_world(each * kept[:, None, None])
     sums[sums[:, 3, 3] == 0] = np.eye(4)
     return se3.make(so3.project(sums[:, :3, :3]), sums[:, :3, 3] / sums[:, 3, 3, None])
 
@@ -50,9 +53,9 @@ def scatter(data: HandEyeData, X: Array, kept: Mask) -> Scatter:
     """Return how far P_i X Q_i^-1 of kept poses lies from the mean of its world, rms."""
     if not kept.any():
         return Scatter(0.0, 0.0)
-    mean = fixed_transforms(data, X, kept)[data.world[kept]]
-    angle, distance = apart(mean, (data.P @ X @ se3.inverse(data.Q))[kept])
-    return Scatter(float(np.sqrt(np.mean(angle**2))), float(np.sqrt(np.mean(distance**2))))
+    each = data.P @ X @ se3.inverse(data.Q)
+    angle, distance = apart(_means(data, each, kept)[data.world], each)
+    return Scatter(float(np.sqrt(np.mean(angle[kept] ** 2))), float(np.sqrt(np.mean(distance[kept] ** 2))))
 
 
 def pairs_of(data: HandEyeData, among: Mask) -> Index:
@@ -79,9 +82,10 @@ def solve(name: str, data: HandEyeData, kept: Mask, pairs: Index) -> tuple[Array
 def methods_of(data: HandEyeData, found: Refined, cov: Array, pairs: Index) -> dict[str, Method]:
     """Return every closed form on the poses that were kept, failures too; those of A X = Z B are for one world."""
     sigma_p, sigma_R = (float(np.sqrt(np.linalg.eigvalsh(cov[part, part])[-1])) for part in (slice(0, 3), slice(3, 6)))
+    A, B = motions(data.P, pairs), motions(data.Q, pairs)
     out = {}
     for name in (*METHODS, *(WORLD_METHODS if data.n_worlds == 1 else ())):
-        X, _ = solve(name, data, found.kept, pairs)
+        X = METHODS[name](A, B, None) if name in METHODS else WORLD_METHODS[name](data.P[found.kept], data.Q[found.kept], None)[0]
         angle, distance = (float(v) for v in apart(found.X, X))
         failed = angle > max(_FAR_TURN, _FAR_FROM * sigma_R) or distance > max(_FAR_SHIFT, _FAR_FROM * sigma_p)
         out[name] = Method(X, scatter(data, X, found.kept), angle, distance, failed)

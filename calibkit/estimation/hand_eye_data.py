@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from calibkit.errors import BadInputError
 from calibkit.estimation.hand_eye_world import SETUPS
@@ -89,6 +90,12 @@ class HandEyeData:
     @property
     def n_worlds(self) -> int:
         return int(self.world.max(initial=-1)) + 1
+
+    def sum_by_world(self, values: Array) -> Array:
+        """Return the sums (n_worlds, ...) of the poses' values (n, ...)."""
+        n = len(values)
+        member = sparse.csc_array((np.ones(n), self.world, np.arange(n + 1)), shape=(self.n_worlds, n))
+        return np.asarray(member @ values.reshape(n, -1)).reshape(-1, *values.shape[1:])
 
     @property
     def slots(self) -> Index:

@@ -14,6 +14,7 @@ Index = NDArray[np.intp]
 _EPS = float(np.finfo(float).eps)
 # Quaternions' w_A + w_B below which noise may have turned the axis of one motion round: both angles within 6 deg of 180 deg.
 _NEAR_HALF_TURN = 0.1
+_PIECE = 256  # rows
 _SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
@@ -41,7 +42,7 @@ def solve(M: Array, y: Array) -> Array:
     Rotation matrices carry an absolute error of eps, whatever the angle: hence the absolute part of the floor.
     """
     c = M.shape[-1]
-    triangle = np.asarray(np.linalg.qr(np.concatenate([M, y[..., None]], axis=-1), mode="r"))  # far fewer rows, the same least squares
+    triangle = _triangle(np.concatenate([M, y[..., None]], axis=-1))  # far fewer rows, the same least squares
     U, s, Vt = np.linalg.svd(triangle[..., :c], full_matrices=False)
     floor = 4 * _EPS * (np.sqrt(M.shape[-2]) + s[..., :1])
     coordinates = (np.swapaxes(U, -1, -2) @ triangle[..., c:])[..., 0] * np.where(s > floor, 1 / np.maximum(s, floor), 0.0)
@@ -51,8 +52,19 @@ def solve(M: Array, y: Array) -> Array:
 
 def null_space(M: Array, dimension: int) -> Array:
     """Return the right singular vectors of the smallest singular values as rows (..., dimension, c), the smallest last."""
-    Vt: Array = np.linalg.svd(np.linalg.qr(M, mode="r"), full_matrices=True)[2]
+    Vt: Array = np.linalg.svd(_triangle(M), full_matrices=True)[2]
     return Vt[..., -dimension:, :]
+
+
+def _triangle(M: Array) -> Array:
+    """Return R of M = QR; many rows in pieces that the cache holds first (Demmel et al. 2012)."""
+    n, c = M.shape[-2:]
+    pieces = n // _PIECE
+    if pieces > 1:
+        whole = M[..., : pieces * _PIECE, :].reshape(*M.shape[:-2], pieces, _PIECE, c)
+        small = np.asarray(np.linalg.qr(whole, mode="r"))
+        M = np.concatenate([small.reshape(*M.shape[:-2], -1, c), M[..., pieces * _PIECE :, :]], axis=-2)
+    return np.asarray(np.linalg.qr(M, mode="r"))
 
 
 def near_half_turn(qa: Array, qb: Array) -> NDArray[np.bool_]:

@@ -93,7 +93,7 @@ def contradicts(data: HandEyeData, M: Array, e: Array, kinds: Array, theta: Arra
         both.append(believed(data, noise, weighed(kinds[:, :on], values[:on]), kept, system, chance=False)[1])
     ml, reach = both
     d = reach.cov @ reach.gradient - ml.cov @ ml.gradient
-    RW = np.swapaxes(reach.J_X, 1, 2) @ np.linalg.inv(C_loose) * (kept & reach.active)[:, None, None]
+    RW = np.swapaxes(reach.J_X, 1, 2) @ reach.W * (kept & reach.active)[:, None, None]
     V = (reach.cov @ np.sum(RW @ C @ np.swapaxes(RW, 1, 2), axis=0) @ reach.cov - ml.cov)[3:, 3:]
     values, vectors = np.linalg.eigh(V)
     tells = values > _SAME * np.linalg.eigvalsh(ml.cov[3:, 3:])[-1]  # elsewhere the two have the same R
@@ -120,15 +120,15 @@ def told(kinds: Array, theta: Array, e: Array, spread: Array, beside: tuple[floa
     """
     W = np.linalg.inv(weighed(kinds, theta))
     # What the fit has not taken: a share that hardly changes, and that is 0 to rounding where a kind of noise is all taken.
-    left = np.maximum(np.einsum("nij,nkji->k", W - W @ spread @ W, kinds) / np.einsum("nij,nkji->k", W, kinds), 1e-3)
+    left = np.maximum(np.einsum("nij,nkij->k", W - W @ spread @ W, kinds) / np.einsum("nij,nkij->k", W, kinds), 1e-3)
     squares, number = np.zeros(len(theta)), np.zeros(len(theta))
     if beside is not None:
         squares[-1], number[-1] = beside
     for _ in range(2):
         W = np.linalg.inv(weighed(kinds, theta))
         We = W @ e[:, :, None]
-        found = np.einsum("nia,nkij,njb->k", We, kinds, We, optimize=True) + squares / theta**2
-        theta = theta * found / (left * np.einsum("nij,nkji->k", W, kinds) + number / theta) + 1e-3 * _FINEST
+        found = np.einsum("nij,nkij->k", We @ np.swapaxes(We, 1, 2), kinds) + squares / theta**2
+        theta = theta * found / (left * np.einsum("nij,nkij->k", W, kinds) + number / theta) + 1e-3 * _FINEST
     return theta
 
 

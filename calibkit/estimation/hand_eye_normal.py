@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibkit.estimation.hand_eye_data import HandEyeData, Mask
+from calibkit.estimation.hand_eye_data import HandEyeData, Index, Mask
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
@@ -14,6 +14,9 @@ ENOUGH_FOR_NOISE = 1000  # poses: sigmas to 1 %
 _FAR = np.array([100.0] * 3 + [10.0] * 3) ** -2.0  # information before any: nothing is farther than 100 m and 10 rad
 _NOTHING = 1e-8  # information in 1 mm and 1 mrad: of what is known to 10 m and 10 rad
 _ROUNDING = 1e-13
+# ad(d) = d_k _AD[k], the derivative of Ad(retract(I, d)).
+_AD = np.zeros((6, 6, 6))
+_AD[3:, :3, :3] = _AD[3:, 3:, 3:] = _AD[:3, :3, 3:] = so3.hat(np.eye(3))
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class Normal:
     apart: Array  # (n_worlds, 6) z_w for x = 0
     J_Z: Array  # (n, 6, 6) Ad(M^-1)
     J_X: Array  # (n, 6, 6) d e_i / d x with z_w following
+    W: Array  # (n, 6, 6) C^-1
     active: Mask  # (n,) whose world has two kept poses or more
     free: Array  # (6, k) directions of x that the poses tell of, orthonormal in SCALES; the others stay as they are
 
@@ -42,24 +46,22 @@ class Normal:
         out: Array = SCALES[:, None] * np.linalg.svd(self.free / SCALES[:, None])[0][:, self.free.shape[1] :]
         return out
 
-    def spread_parts(self, data: HandEyeData) -> tuple[Array, Array]:
-        """Return the covariance (n, 6, 6) of the fitted e_i, by z_w given x and by x."""
-        by_world = self.J_Z @ np.linalg.inv(self.A)[data.world] @ np.swapaxes(self.J_Z, 1, 2)
-        return by_world, self.J_X @ self.cov @ np.swapaxes(self.J_X, 1, 2)
+    def spread_parts(self, data: HandEyeData, at: Index | slice = slice(None)) -> tuple[Array, Array]:
+        """Return the covariance (k, 6, 6) of the fitted e_i of the poses `at`, by z_w given x and by x."""
+        J_Z, J_X = self.J_Z[at], self.J_X[at]
+        by_world = J_Z @ np.linalg.inv(self.A)[data.world[at]] @ np.swapaxes(J_Z, 1, 2)
+        return by_world, J_X @ self.cov @ np.swapaxes(J_X, 1, 2)
 
-    def spread(self, data: HandEyeData) -> Array:
-        """Return their sum."""
-        by_world, by_X = self.spread_parts(data)
-        out: Array = by_world + by_X
-        return out
-
-    def respond(self, data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> tuple[Array, Array, Array]:
-        """Return x (6,) and z (n_worlds, 6) that answer to e (n, 6), and what is left of it, under these equations' C and kept."""
-        of_e = normal(data, M, C, e, kept)
-        x: Array = self.cov @ of_e.gradient
-        z: Array = of_e.apart + of_e.follow @ x
+    def step(self, data: HandEyeData, e: Array) -> tuple[Array, Array, Array]:
+        """Return x (6,) and z (n_worlds, 6) of least squares, and what is left of e (n, 6), which the equations are of."""
+        x: Array = self.cov @ self.gradient
+        z: Array = self.apart + self.follow @ x
         left: Array = e + x - (self.J_Z @ z[data.world][:, :, None])[:, :, 0]
         return x, z, left
+
+    def respond(self, data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> tuple[Array, Array, Array]:
+        """Return the step that another e (n, 6) would bring under these equations' C and kept."""
+        return replace(normal(data, M, C, e, kept), free=self.free).step(data, e)
 
 
 def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Normal:
@@ -67,18 +69,19 @@ def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Norma
 
     A world with fewer than two kept poses says nothing of X; its Z is that of all its poses.
     """
-    W, J_Z = np.linalg.inv(C), se3.adjoint(se3.inverse(M))
+    W = np.asarray(np.linalg.inv(C), np.float64)
+    J_Z = se3.adjoint(se3.inverse(M))
     active = (np.bincount(data.world, kept, data.n_worlds) >= 2)[data.world]
     JW = np.swapaxes(J_Z, 1, 2) @ W * (kept | ~active)[:, None, None]
-    A = _by_world(data, JW @ J_Z) + np.diag(_FAR)
-    right = _by_world(data, np.concatenate([JW, (JW @ e[:, :, None])], axis=2))
+    A = data.sum_by_world(JW @ J_Z) + np.diag(_FAR)
+    right = data.sum_by_world(np.concatenate([JW, JW @ e[:, :, None]], axis=2))
     solved = np.asarray(np.linalg.solve(A, right), np.float64)
     follow, apart = solved[:, :, :6], solved[:, :, 6]
     J_X = J_Z @ follow[data.world] - np.eye(6)
     RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
     left = e - (J_Z @ apart[data.world][:, :, None])[:, :, 0]
     S = np.sum(RW @ J_X, axis=0) + np.diag(_FAR)
-    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, active, np.zeros((6, 0)))
+    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, W, active, np.zeros((6, 0)))
 
 
 def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal, chance: bool = True) -> tuple[Array, Normal]:
@@ -90,14 +93,10 @@ def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal
     used = np.flatnonzero(kept & system.active)
     worlds = len(np.unique(data.world[used]))
     some = used[:: max(1, len(used) // ENOUGH_FOR_NOISE)]
-    W = np.linalg.inv(C[some])
-    D = C_P[some] @ W @ (C - C_P)[some]
-    values, vectors = np.linalg.eigh((D + np.swapaxes(D, 1, 2)) / 2)
-    roots = np.swapaxes(vectors * np.sqrt(np.maximum(values, 0))[:, None, :], 1, 2)
-    ad = np.zeros((*roots.shape, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = so3.hat(roots[..., 3:])
-    ad[..., :3, 3:] = so3.hat(roots[..., :3])
-    by_chance = np.einsum("nkai,nab,nkbj->ij", ad, W, ad, optimize=True) * len(used) / max(len(some), 1)
+    W = system.W[some]
+    D = C_P[some] @ W @ (C[some] - C_P[some])
+    by_chance = np.einsum("klab,kai,lbj->ij", np.tensordot(D, W, axes=(0, 0)), _AD, _AD, optimize=True) * len(used) / max(len(some), 1)
+    by_chance = (by_chance + by_chance.T) / 2
     units = SCALES[:, None] * SCALES
     if chance:
         by_chance = by_chance * (1 + (np.sqrt(2) + 3) / np.sqrt(max(len(used) - worlds, 1))) ** 2
@@ -106,11 +105,3 @@ def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal
     empty = values < np.maximum(whole / 2, max(2 * _NOTHING, _ROUNDING * values[-1]))  # twice: without a pose R's is that of _FAR alone
     back = vectors * SCALES[:, None]
     return back / np.where(empty, _NOTHING, values) @ back.T, replace(system, free=vectors[:, ~empty] * SCALES[:, None])
-
-
-def _by_world(data: HandEyeData, values: Array) -> Array:
-    if data.n_worlds == 1:
-        return np.asarray(values.sum(axis=0, keepdims=True))
-    out = np.zeros((data.n_worlds, *values.shape[1:]))
-    np.add.at(out, data.world, values)
-    return out

@@ -20,7 +20,7 @@ from calibkit.estimation.hand_eye_lens import lens_step
 from calibkit.estimation.hand_eye_noise import RobotNoise
 from calibkit.estimation.hand_eye_normal import ENOUGH_FOR_NOISE, Normal, believed, normal
 from calibkit.estimation.hand_eye_robust import FEWEST_OTHERS, Seed
-from calibkit.geometry import se3
+from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 
 _WRONG = 1e-4  # of the good poses lie beyond the limit
@@ -66,7 +66,7 @@ def refine(data: HandEyeData, start: Seed, corners: Corners | None = None, robot
     X, Z, M, kept = start.X, start.Z, data.Q, start.kept
     data, sight = _seen(data, corners, M)
     exact = robot is not None and robot.exact
-    e, kinds = residuals(data, X, Z, M)
+    e, away, kinds = residuals(data, X, Z, M)
     theta, least, most = noise.first(data, e[kept], robot, sight is not None)
     system: Normal | None = None
     reversals, converged, by_reach, lens_open = 0, False, False, 0.0
@@ -78,26 +78,27 @@ def refine(data: HandEyeData, start: Seed, corners: Corners | None = None, robot
             at = np.flatnonzero(system.active & kept)
             at = at[:: max(1, len(at) // ENOUGH_FOR_NOISE)]
             beside = None if sight is None or exact else (sight.chi2, sight.freedom)
-            theta = np.clip(noise.told(kinds[at], theta, e[at], system.spread(data)[at], beside), least, most)
+            theta = np.clip(noise.told(kinds[at], theta, e[at], np.add(*system.spread_parts(data, at)), beside), least, most)
             theta = noise.by_reach(data, kept, theta) if by_reach else theta
         noise_settled = bool(np.all(np.abs(noise.mean_diagonal(kinds, theta) / before - 1) < _NOISE_SETTLED))
         C, C_P = noise.weighed(kinds, theta), noise.weighed(kinds[:, :on_P], theta[:on_P])
         system = normal(data, M, C, e, kept)
         if number >= _STILL:
             system = believed(data, C, C_P, kept, system, chance=False)[1]
-        x, z, left = system.respond(data, M, C, e, kept)
-        away = se3.local(M, data.Q)
+        x, z, left = system.step(data, e)
         if corners is not None and sight is not None and corners.free:
             lens = lens_step(data, system, M, C, left, kept, corners, sight, theta[-1])
             x, z, left = x + lens.X @ lens.d, z + lens.Z @ lens.d, left + lens.left @ lens.d
             away = away - sight.K @ lens.d
             corners = replace(corners, lens=corners.lens + lens.d)
             lens_open = float(lens.d @ lens.information @ lens.d)
-        chi2 = _chi2(data, C, left, kept, system)
         # A wrong pose is not one to adjust: its M would run away.
-        m = away + kept[:, None] * ((C - C_P) @ np.linalg.solve(C, left[:, :, None]))[:, :, 0]
+        m = away + kept[:, None] * ((C - C_P) @ (system.W @ left[:, :, None]))[:, :, 0]
         still = float(x @ system.S @ x) + lens_open < _SETTLED
-        if number >= _STILL and (noise_settled or number >= _LONG) and still:
+        settled = number >= _STILL and (noise_settled or number >= _LONG) and still
+        if settled or number == _MAX_STEPS - 1:
+            chi2 = _chi2(data, C, left, kept, system)
+        if settled:
             now = chi2 < wrong_beyond(freedom) if freedom and len(kept) > FEWEST_OTHERS else kept
             converged = np.array_equal(now, kept) or reversals == _MAX_REVERSALS
             if converged and robot is None and not by_reach:
@@ -109,7 +110,7 @@ def refine(data: HandEyeData, start: Seed, corners: Corners | None = None, robot
         X, Z, M = se3.retract(X, x), se3.retract(Z, z), se3.retract(M, m)
         corners = corners.without_outliers(M) if corners is not None and number < _CHOOSING else corners
         data, sight = _seen(data, corners, M)
-        e, kinds = residuals(data, X, Z, M)
+        e, away, kinds = residuals(data, X, Z, M)
         if converged:
             break
     sigmas = dict(zip(noise.names(data), np.sqrt(theta).tolist(), strict=True))
@@ -125,23 +126,31 @@ def _seen(data: HandEyeData, corners: Corners | None, M: Array) -> tuple[HandEye
     return replace(data, Q=sight.Q, cov_Q=sight.cov), sight
 
 
-def residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, Array]:
-    """Return e (n, 6) and the covariances (n, k, 6, 6) of one unit of each kind of noise, P's first."""
-    P = Z[data.world] @ M @ se3.inverse(X)
-    on_P = se3.adjoint(se3.inverse(X))
-    e = se3.local(P, data.P) @ on_P.T - se3.local(M, data.Q)
-    world_P, world_Q = se3.adjoint(se3.inverse(Z[data.world] @ M)), se3.adjoint(se3.inverse(M))
-    sides = (
-        (data.cov_P, on_P, world_P if data.words.P_at_world else np.broadcast_to(on_P, world_P.shape)),
-        (data.cov_Q, np.eye(6), world_Q if data.words.Q_at_world else np.broadcast_to(np.eye(6), world_Q.shape)),
-    )
-    kinds = []
-    for cov, carried, isotropic in sides:
-        if cov is not None:
-            kinds.append(carried @ cov @ carried.T)
-        else:
-            kinds += [isotropic[:, :, part] @ np.swapaxes(isotropic[:, :, part], 1, 2) for part in (slice(3, 6), slice(0, 3))]
-    return e, np.stack(kinds, axis=1)
+def residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, Array, Array]:
+    """Return e (n, 6), local(M, Q) (n, 6), and the covariances (n, k, 6, 6) of one unit of each kind of noise, P's first."""
+    ZM, to_2 = Z[data.world] @ M, se3.inverse(X)
+    on_P = se3.adjoint(to_2)
+    away = se3.local(M, data.Q)
+    e = se3.local(ZM @ to_2, data.P) @ on_P.T - away
+    kinds: list[Array] = []
+    if data.cov_P is None:
+        kinds += _isotropic(se3.inverse(ZM) if data.words.P_at_world else to_2)
+    else:
+        kinds.append(on_P @ data.cov_P @ on_P.T)
+    if data.cov_Q is None:
+        kinds += _isotropic(se3.inverse(M) if data.words.Q_at_world else np.eye(4))
+    else:
+        kinds.append(data.cov_Q)
+    out = np.empty((len(M), len(kinds), 6, 6))
+    for k, kind in enumerate(kinds):
+        out[:, k] = kind
+    return e, away, out
+
+
+def _isotropic(T: Array) -> tuple[Array, Array]:
+    """Return Ad(T) Ad(T)^T (..., 6, 6) of turns alone and of shifts alone: only where T's right end lies from its left counts."""
+    turns = np.concatenate([so3.hat(T[..., :3, 3]), np.broadcast_to(np.eye(3), (*T.shape[:-2], 3, 3))], axis=-2)
+    return turns @ np.swapaxes(turns, -1, -2), np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _chi2(data: HandEyeData, C: Array, left: Array, kept: Mask, system: Normal) -> Array:

@@ -43,22 +43,20 @@ def seed(data: HandEyeData, rng: np.random.Generator) -> Seed:
     some = slice(0, len(draws) // 3)
     X = np.concatenate([park(A, B), one_axis(A[some], B[some]), no_axis(A[some], B[some])])
     best = X[np.argmin(_scores(X, motions(data.P, scored), motions(data.Q, scored)))]
-    kept, _, _ = inliers(data, best)
+    kept, sigma_phi, sigma_rho = inliers(data, best)
     rank = 0
     for _ in range(_ROUNDS):
         pairs = pairs_of(data, kept, rng)
         if len(pairs) == 0:
             break
         A, B = motions(data.P, pairs), motions(data.Q, pairs)
-        _, sigma_phi, _ = inliers(data, best)
         # Pairs share poses: chance adds what it adds to as many motions as there are poses.
         rank = int(spectrum(A).rank(np.sqrt(2) * sigma_phi * (1 + (np.sqrt(2) + 3) / np.sqrt(len(np.unique(pairs))))))
         trial = SEEDS[rank](A, B, None)
-        again, _, _ = inliers(data, trial)
+        again, phi, rho = inliers(data, trial)
         if again.sum() < 0.9 * kept.sum():
             break
-        best, kept = trial, again
-    kept, sigma_phi, sigma_rho = inliers(data, best)
+        best, kept, sigma_phi, sigma_rho = trial, again, phi, rho
     return Seed(best, worlds(data, best, kept), kept, rank, sigma_phi, sigma_rho)
 
 

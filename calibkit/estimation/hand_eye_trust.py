@@ -76,7 +76,7 @@ def _sandwich(data: HandEyeData, fit: Refined, system: Normal) -> tuple[Array, A
         given_x[6:, 6:] = np.linalg.inv(system.A[0])
     if J.shape[2] == 0 or len(used) == 0:
         return given_x, given_x
-    JW = np.swapaxes(J, 1, 2) @ np.linalg.inv(fit.C[used])
+    JW = np.swapaxes(J, 1, 2) @ system.W[used]
     S, scores = JW @ J, (JW @ fit.e[used][:, :, None])[:, :, 0]
     units, prior = np.ones(J.shape[2]), _LITTLE * np.eye(J.shape[2])
     if data.t_s is not None and one:

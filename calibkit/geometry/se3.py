@@ -40,8 +40,10 @@ def retract(T: Array, step: Array) -> Array:
 
 def local(T: Array, other: Array) -> Array:
     """Return the step (..., 6) with retract(T, step) = other."""
-    d = inverse(T) @ np.asarray(other, float)
-    return np.concatenate([d[..., :3, 3], so3.log(d[..., :3, :3])], axis=-1)
+    T, other = np.asarray(T, float), np.asarray(other, float)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    rho = Rt @ (other[..., :3, 3] - T[..., :3, 3])[..., None]
+    return np.concatenate([rho[..., 0], so3.log(Rt @ other[..., :3, :3])], axis=-1)
 
 
 def adjoint(T: Array) -> Array:

@@ -75,20 +75,14 @@ def right_jacobian_inverse(v: Array) -> Array:
 
 def to_quat(R: Array) -> Array:
     """Return unit quaternions xyzw with w >= 0 from rotation matrices (Shepperd 1978: the largest component first)."""
-    R = np.asarray(R, float)
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
-    choice = np.argmax(np.concatenate([diagonal, trace[..., None]], axis=-1), axis=-1)
-    candidates = np.empty((*R.shape[:-2], 4, 4))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        candidates[..., i, i] = 1 + 2 * diagonal[..., i] - trace
-        candidates[..., i, j] = R[..., j, i] + R[..., i, j]
-        candidates[..., i, k] = R[..., k, i] + R[..., i, k]
-        candidates[..., i, 3] = R[..., k, j] - R[..., j, k]
-        candidates[..., 3, i] = R[..., k, j] - R[..., j, k]
-    candidates[..., 3, 3] = 1 + trace
-    q: Array = np.take_along_axis(candidates, choice[..., None, None], axis=-2)[..., 0, :]
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(np.asarray(R, float), (-2, -1), (0, 1))
+    x, y, z = h - f, c - g, d - b
+    # 4 q q^T, the batch behind: each row is q times one of its components.
+    rows = np.array(
+        [[1 + a - e - i, b + d, c + g, x], [b + d, 1 - a + e - i, f + h, y], [c + g, f + h, 1 - a - e + i, z], [x, y, z, 1 + a + e + i]]
+    )
+    largest = np.argmax(np.einsum("kk...->k...", rows), axis=0)
+    q: Array = np.moveaxis(np.take_along_axis(rows, largest[None, None], axis=0)[0], 0, -1)
     q /= np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., 3:] < 0, -q, q)
 

@@ -3,9 +3,10 @@
 r = (uv - project(T_c_cam0 T_cam0_board p_board; lens_c)) / sigma
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from calibkit.solver.robust import cauchy
 
 _CHUNK_POINTS = 8192  # points a chunk: its planes stay in the second-level cache
 _THREADED_POINTS = 4 * _CHUNK_POINTS
+
+A = TypeVar("A")
 
 
 @dataclass(frozen=True)
@@ -156,47 +159,17 @@ class CameraProblem:
         C[fixed, fixed] = 1
 
     def _map_chunks(self, x: LensState, c: int, views: CameraViews) -> list[tuple[slice, Array, float]]:
-        f, n = views.weight.shape
-        size = max(1, _CHUNK_POINTS // n)
-        chunks = [slice(start, min(start + size, f)) for start in range(0, f, size)]
-
         def one(rows: slice) -> tuple[slice, Array, float]:
             G, cost = self._normal_blocks(x, c, views, rows)
             return rows, G, cost
 
-        if f * n < _THREADED_POINTS:
-            return [one(rows) for rows in chunks]
-        with ThreadPoolExecutor(2) as pool:  # numpy lets go of the GIL in its kernels; the order of the sums stays fixed
-            return list(pool.map(one, chunks))
+        return map_views(views, one)
 
     def _normal_blocks(self, x: LensState, c: int, views: CameraViews, rows: slice) -> tuple[Array, float]:
         """Return per view the products G of its columns [pose | rig | lens | residual], and the cost."""
-        weight, T_rig = views.weight[rows], x.T_cam_cam0[c]
+        T_rig = x.T_cam_cam0[c]
         T = T_rig @ x.T_cam0_board[views.instant[rows]]
-        in_camera = se3.transform(T, self.points)
-        projection = views.model.project(in_camera, x.lenses[c], jacobians=True)
-        assert projection.J_point is not None
-        assert projection.J_params is not None
-        usable = (weight > 0) & projection.valid
-        r = np.where(usable, np.moveaxis(views.uv[rows] - projection.uv, -1, 0), 0.0) * weight
-        loss, down = cauchy(r[0] ** 2 + r[1] ** 2, self.loss_scale)
-        # A corner that leaves the model's domain costs as much as one a whole image away: no gain in pushing it out.
-        lost = (weight > 0) & ~projection.valid
-        penalty, _ = cauchy((max(views.image_size) * weight[lost]) ** 2, self.loss_scale)
-        cost = float(np.sum(loss) + np.sum(penalty))
-
-        # K (2, columns, f, n): a point moved in the camera frame by rho + phi x p, then the lens, then the residual.
-        down = np.sqrt(down)
-        w = np.where(usable, weight * down, 0.0)
-        K = np.empty((2, 6 + len(x.lenses[c]) + 1, *w.shape))
-        np.multiply(np.moveaxis(projection.J_point, (-2, -1), (0, 1)), w, out=K[:, :3])
-        p = np.moveaxis(in_camera, -1, 0)
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            np.subtract(p[i] * K[:, j], p[j] * K[:, i], out=K[:, 3 + k])
-        np.multiply(np.moveaxis(projection.J_params, (-2, -1), (0, 1)), w, out=K[:, 6:-1])
-        np.multiply(r, down, out=K[:, -1])
-        G = np.matmul(K.transpose(0, 2, 1, 3), K.transpose(0, 2, 3, 1)).sum(axis=0)
+        G, cost = corner_products(self.points, views, rows, T, x.lenses[c], self.loss_scale)
         return _in_right_tangents(G, T, T_rig if c else None), cost
 
     def residuals(self, x: LensState, c: int) -> Residuals:
@@ -208,6 +181,51 @@ class CameraProblem:
         seen = (views.weight > 0) & projection.valid
         px = np.where(seen[..., None], views.uv - projection.uv, 0.0)
         return Residuals(px, seen, np.linalg.norm(in_camera, axis=-1), T[:, :3, 2])
+
+
+def map_views(views: CameraViews, one: Callable[[slice], A]) -> list[A]:
+    """Return `one` of each chunk of the views, in their order, on two threads where there are many."""
+    f, n = views.weight.shape
+    size = max(1, _CHUNK_POINTS // n)
+    chunks = [slice(start, min(start + size, f)) for start in range(0, f, size)]
+    if f * n < _THREADED_POINTS:
+        return [one(rows) for rows in chunks]
+    with ThreadPoolExecutor(2) as pool:  # numpy lets go of the GIL in its kernels; the order of the sums stays fixed
+        return list(pool.map(one, chunks))
+
+
+def corner_products(
+    points: Array, views: CameraViews, rows: slice, T_cam_board: Array, lens: Array, loss_scale: float
+) -> tuple[Array, float]:
+    """Return per view the products G (f, 6 + p + 1, 6 + p + 1) of its columns [motion | lens | residual], and the robust cost.
+
+    The motion moves a point in the camera frame by rho + phi x p.
+    """
+    weight = views.weight[rows]
+    in_camera = se3.transform(T_cam_board, points)
+    projection = views.model.project(in_camera, lens, jacobians=True)
+    assert projection.J_point is not None
+    assert projection.J_params is not None
+    usable = (weight > 0) & projection.valid
+    r = np.where(usable, np.moveaxis(views.uv[rows] - projection.uv, -1, 0), 0.0) * weight
+    loss, down = cauchy(r[0] ** 2 + r[1] ** 2, loss_scale)
+    # A corner that leaves the model's domain costs as much as one a whole image away: no gain in pushing it out.
+    lost = (weight > 0) & ~projection.valid
+    penalty, _ = cauchy((max(views.image_size) * weight[lost]) ** 2, loss_scale)
+    cost = float(np.sum(loss) + np.sum(penalty))
+
+    down = np.sqrt(down)
+    w = np.where(usable, weight * down, 0.0)
+    K = np.empty((2, 6 + len(lens) + 1, *w.shape))
+    np.multiply(np.moveaxis(projection.J_point, (-2, -1), (0, 1)), w, out=K[:, :3])
+    p = np.moveaxis(in_camera, -1, 0)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        np.subtract(p[i] * K[:, j], p[j] * K[:, i], out=K[:, 3 + k])
+    np.multiply(np.moveaxis(projection.J_params, (-2, -1), (0, 1)), w, out=K[:, 6:-1])
+    np.multiply(r, down, out=K[:, -1])
+    G: Array = np.matmul(K.transpose(0, 2, 1, 3), K.transpose(0, 2, 3, 1)).sum(axis=0)
+    return G, cost
 
 
 def _in_right_tangents(G: Array, T: Array, T_rig: Array | None) -> Array:

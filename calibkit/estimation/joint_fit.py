@@ -1,0 +1,120 @@
+"""The joint estimate: from the seed through a robust fit to plain least squares with the noise that the residuals show."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.estimation.joint_noise import DRAWS, Component, Drawn, components, draw
+from calibkit.estimation.joint_problem import Frames, JointProblem
+from calibkit.estimation.joint_state import JointState
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+from calibkit.geometry.spline import Steps, basis, turning
+from calibkit.solver.arrowhead import Arrowhead
+from calibkit.solver.levenberg_marquardt import minimise
+from calibkit.solver.robust import scale_of_norms
+
+_LOSS = 4.0  # sigmas
+_OUTLIER_CORNER, _OUTLIER_SAMPLE = 4.5, 5.0  # sigmas: of plain noise one corner in 25 000, one sample in 65 000
+_ROUNDS = 3
+_SETTLED = 0.02  # of a sigma's factor
+_RAYLEIGH_3 = 1.5382  # median length of three standard normal numbers
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The estimate and what it is judged by."""
+
+    problem: JointProblem  # plain least squares, weights as found, what was given up without weight
+    x: JointState
+    system: Arrowhead
+    drawn: Drawn
+    found: tuple[NDArray[np.bool_], ...]  # (f, n) per camera: corners found
+    factors: dict[str, float]  # real sigma over the stated one, by kind
+    components: dict[str, Component]  # by the weights as found
+    converged: bool
+    steps: int
+
+
+def fit_joint(problem: JointProblem, x: JointState) -> JointFit:
+    """Return the maximum-likelihood trajectory and calibration from a start."""
+    found = tuple(frames.views.weight for frames in problem.cameras)
+    factors: dict[str, float] = {}
+    # Wide open first: the seed's IMU sits in the camera.
+    solution = minimise(replace(problem, loss_scale=_LOSS * 20), x, max_steps=4, tolerance=1e-3)
+    steps = solution.steps
+    for _ in range(2):
+        problem = _rescaled(problem, _robust_scales(problem, solution.x, found), factors)
+        solution = minimise(replace(problem, loss_scale=_LOSS), solution.x, max_steps=6, tolerance=1e-4)
+        steps += solution.steps
+    problem = _without_outliers(problem, solution.x, found, factors)
+    for _ in range(_ROUNDS):
+        solution = minimise(problem, solution.x, max_steps=20, tolerance=1e-8)
+        steps += solution.steps
+        _, system = problem.linearize(solution.x)
+        drawn = draw(system, DRAWS)
+        parts = components(problem, solution.x, drawn)
+        scales = {kind: part.factor for kind, part in parts.items() if kind not in ("walk", "stays")}
+        if all(abs(scale - 1) < _SETTLED for scale in scales.values()):
+            break
+        problem = _rescaled(problem, scales, factors)
+    return JointFit(problem, solution.x, system, drawn, tuple(weight > 0 for weight in found), factors, parts, solution.converged, steps)
+
+
+def corner_residuals(problem: JointProblem, x: JointState, c: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Return measured minus predicted corners of camera c (f, n, 2) px, and where the model has a prediction (f, n)."""
+    frames, camera = problem.cameras[c], x.cameras[c]
+    in_camera = se3.transform(poses_of_board(problem, x, c), problem.points)
+    projection = frames.views.model.project(in_camera, camera.lens)
+    return np.where(projection.valid[..., None], frames.views.uv - projection.uv, 0.0), projection.valid
+
+
+def poses_of_board(problem: JointProblem, x: JointState, c: int) -> Array:
+    """Return T_cam_board (f, 4, 4) of camera c's frames."""
+    frames, camera = problem.cameras[c], x.cameras[c]
+    i, u = problem.knots.locate(frames.t + camera.dt)
+    value = basis(problem.knots, u)
+    at = turning(x.R, Steps.of(x.R), i, value, basis(problem.knots, u, 1), jacobians=False)
+    p = np.einsum("nl,nlk->nk", value, x.p[i[:, None] + np.arange(problem.knots.order)])
+    out: Array = camera.T_cam_imu @ se3.inverse(se3.make(at.R, p))
+    return out
+
+
+def _robust_scales(problem: JointProblem, x: JointState, found: Sequence[Array]) -> dict[str, float]:
+    """Return real over stated sigma of each kind, by the median length of its residuals."""
+    r = problem.imu_residuals(x) / problem.imu.sigma
+    scales = {kind: float(np.median(np.linalg.norm(r[:, part], axis=1)) / _RAYLEIGH_3) for kind, part in _PARTS.items()}
+    for c, weight in enumerate(found):
+        px, valid = corner_residuals(problem, x, c)
+        seen = (weight > 0) & valid
+        scales[f"camera {c}"] = scale_of_norms((np.linalg.norm(px, axis=-1) * problem.cameras[c].views.weight)[seen])
+    return scales
+
+
+_PARTS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
+
+
+def _rescaled(problem: JointProblem, scales: dict[str, float], factors: dict[str, float]) -> JointProblem:
+    """Return the problem with sigmas multiplied; `factors` keeps the products."""
+    for kind, scale in scales.items():
+        factors[kind] = factors.get(kind, 1.0) * scale
+    sigma = problem.imu.sigma * np.repeat([scales["gyro"], scales["accel"]], 3)
+    cameras = tuple(
+        Frames(frames.t, replace(frames.views, weight=frames.views.weight / scales[f"camera {c}"]))
+        for c, frames in enumerate(problem.cameras)
+    )
+    return replace(problem, imu=replace(problem.imu, sigma=sigma), cameras=cameras)
+
+
+def _without_outliers(problem: JointProblem, x: JointState, found: Sequence[Array], factors: dict[str, float]) -> JointProblem:
+    """Return the problem without samples and corners that noise does not explain."""
+    r = problem.imu_residuals(x) / problem.imu.sigma
+    keep = np.stack([np.linalg.norm(r[:, part], axis=1) <= _OUTLIER_SAMPLE for part in _PARTS.values()], axis=1)
+    cameras = []
+    for c, (frames, weight) in enumerate(zip(problem.cameras, found, strict=True)):
+        px, valid = corner_residuals(problem, x, c)
+        fits = valid & (np.linalg.norm(px, axis=-1) * weight <= _OUTLIER_CORNER * factors[f"camera {c}"])
+        cameras.append(Frames(frames.t, replace(frames.views, weight=np.where(fits, frames.views.weight, 0.0))))
+    return replace(problem, imu=replace(problem.imu, keep=keep), cameras=tuple(cameras))

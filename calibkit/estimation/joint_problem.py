@@ -1,0 +1,241 @@
+"""The joint estimator as one least-squares problem: corners, gyroscope, accelerometer and bias walks on one continuous-time trajectory.
+
+gyro   w_meas - (omega(t) + b_g)
+accel  a_meas - (R(t)^T (p''(t) - g) + b_a)
+corner uv - project(T_cam_imu T_world_imu(t + dt)^-1 P; lens)
+walk   b_{j+1} - b_j ~ N(0, walk^2 h)
+(Furgale, Rehder, Siegwart 2013; the trajectory as in `geometry.spline`.)
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibkit.estimation.camera_problem import CameraViews, corner_products, map_views
+from calibkit.estimation.joint_parts import Index, Part, assemble
+from calibkit.estimation.joint_state import GRAVITY, KNOT, Border, JointState, retract
+from calibkit.geometry import se3, so3
+from calibkit.geometry.so3 import Array
+from calibkit.geometry.spline import Knots, Steps, basis, turning
+from calibkit.solver.arrowhead import Arrowhead
+from calibkit.solver.robust import cauchy
+
+_CHUNK = 4000  # IMU samples worked on at once: memory stays flat
+# A trajectory that nothing measures stays as it moves: what moves more than this has sensors of its own to say so.
+_TURN_CHANGE, _ACCELERATION = 200.0, 100.0  # rad/s^2, m/s^2
+
+
+@dataclass(frozen=True)
+class ImuRows:
+    """One IMU's samples, and how each is weighed."""
+
+    t: Array  # (n,) s
+    gyro: Array  # (n, 3) rad/s
+    accel: Array  # (n, 3) m/s^2
+    sigma: Array  # (6,) of one sample: gyro, accel
+    walk: Array  # (6,) rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)
+    keep: NDArray[np.bool_]  # (n, 2) gyro, accel
+
+
+@dataclass(frozen=True)
+class Frames:
+    """One camera's corners; each view has its own time."""
+
+    t: Array  # (f,) s on the camera's clock
+    views: CameraViews  # `instant` is not used
+
+
+@dataclass(frozen=True)
+class GravityPrior:
+    size: float  # m/s^2
+    sigma: float
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """All measurements of a recording."""
+
+    knots: Knots
+    points: Array  # (n, 3) m, the board's corners
+    imu: ImuRows
+    cameras: tuple[Frames, ...]
+    gravity: GravityPrior
+    loss_scale: float = np.inf  # Cauchy's, in sigmas
+    lens_priors: tuple[tuple[Array, Array] | None, ...] = ()  # lens and information (l, l) of each camera, where it is known
+
+    @property
+    def border(self) -> Border:
+        return Border(tuple(len(frames.views.model.parameter_names) for frames in self.cameras))
+
+    def retract(self, x: JointState, core: Array, border: Array) -> JointState:
+        return retract(x, core, border)
+
+    def linearize(self, x: JointState) -> tuple[float, Arrowhead]:
+        cost, system = assemble(self.parts(x), self.knots.controls, self.knots.order, self.border.size)
+        prior_cost, C, g = self.prior(x)
+        return cost + prior_cost, Arrowhead(system.core, system.border, system.corner + C, system.gradient_core, system.gradient_border + g)
+
+    def prior(self, x: JointState) -> tuple[float, Array, Array]:
+        """Return what is known beforehand: its cost, information (p, p) and gradient (p,)."""
+        p = self.border.size
+        C, g = np.zeros((p, p)), np.zeros(p)
+        size = float(np.linalg.norm(x.gravity))
+        J = x.gravity / size / self.gravity.sigma
+        r = (self.gravity.size - size) / self.gravity.sigma
+        C[GRAVITY, GRAVITY], g[GRAVITY] = np.outer(J, J), J * r
+        cost = r * r
+        for c, prior in enumerate(self.lens_priors):
+            if prior is not None:
+                where, (lens, information) = self.border.lens(c), prior
+                off = lens - x.cameras[c].lens
+                C[where, where], g[where] = information, information @ off
+                cost += float(off @ information @ off)
+        return cost, C, g
+
+    def parts(self, x: JointState) -> Iterator[Part]:
+        """Yield the normal equations' pieces at x."""
+        steps = Steps.of(x.R)
+        chunks = [slice(start, start + _CHUNK) for start in range(0, len(self.imu.t), _CHUNK)]
+        with ThreadPoolExecutor(2) as pool:  # numpy lets go of the GIL in its kernels
+            for pair in pool.map(lambda rows: self._imu(x, steps, rows), chunks):
+                yield from pair
+        for c in range(len(self.cameras)):
+            yield from self._frames(x, steps, c)
+        yield self._walk(x)
+        yield self._stays(x, steps)
+
+    def imu_residuals(self, x: JointState) -> Array:
+        """Return measured minus predicted (n, 6): rad/s, m/s^2."""
+        steps = Steps.of(x.R)
+        i, u = self.knots.locate(self.imu.t)
+        value, rate, second = (basis(self.knots, u, r) for r in range(3))
+        near = i[:, None] + np.arange(self.knots.order)
+        at = turning(x.R, steps, i, value, rate, jacobians=False)
+        force = np.einsum("nji,nj->ni", at.R, np.einsum("nl,nlk->nk", second, x.p[near]) - x.gravity)
+        predicted = np.concatenate([at.omega, force], axis=1) + x.bias[i]
+        return np.concatenate([self.imu.gyro, self.imu.accel], axis=1) - predicted
+
+    def _imu(self, x: JointState, steps: Steps, rows: slice) -> tuple[Part, Part]:
+        """Return what some samples of gyroscope and accelerometer say."""
+        imu, k = self.imu, self.knots.order
+        i, u = self.knots.locate(imu.t[rows])
+        value, rate, second = (basis(self.knots, u, r) for r in range(3))
+        at = turning(x.R, steps, i, value, rate)
+        RT = np.swapaxes(at.R, 1, 2)
+        acceleration = np.einsum("nl,nlk->nk", second, x.p[i[:, None] + np.arange(k)])
+        force = (RT @ (acceleration - x.gravity)[..., None])[..., 0]
+        n, bias = len(i), x.bias[i]
+
+        rotation = KNOT * np.arange(k)[:, None] + np.arange(3)
+        K = np.empty((n, 3, 3 * k + 3 + 1))
+        K[:, :, :3], K[:, :, 6:-1] = at.domega[:, :, 0], at.domega[:, :, 1:].reshape(n, 3, -1)
+        K[:, :, 3:6] = np.eye(3)
+        K[:, :, -1] = imu.gyro[rows] - at.omega - bias[:, :3]
+        offsets = np.concatenate([rotation[0], np.arange(6, 9), rotation[1:].ravel()])
+        gyro = self._samples("gyro", K, imu.sigma[:3], imu.keep[rows, 0], i, offsets, 0)
+
+        motion = KNOT * np.arange(1, k)[:, None] + np.arange(6)
+        by_knot = np.empty((n, 3, k, 6))
+        by_knot[..., :3] = np.einsum("nab,nbkc->nakc", so3.hat(force), at.dR)
+        by_knot[..., 3:] = second[:, None, :, None] * RT[:, :, None, :]
+        K = np.empty((n, 3, 6 * k + 3 + 3 + 1))
+        K[:, :, :6], K[:, :, 9 : 6 * k + 3] = by_knot[:, :, 0], by_knot[:, :, 1:].reshape(n, 3, -1)
+        K[:, :, 6:9] = np.eye(3)
+        K[:, :, -4:-1] = -RT
+        K[:, :, -1] = imu.accel[rows] - force - bias[:, 3:]
+        offsets = np.concatenate([np.arange(6), np.arange(9, 12), motion.ravel()])
+        return gyro, self._samples("accel", K, imu.sigma[3:], imu.keep[rows, 1], i, offsets, GRAVITY.stop)
+
+    def _samples(self, kind: str, K: Array, sigma: Array, keep: NDArray[np.bool_], i: Index, offsets: Index, gravity: int) -> Part:
+        """Return the products of rows K (n, 3, q), weighed, by the segments i that they fall into."""
+        K /= sigma[:, None]
+        loss, down = cauchy(np.sum(K[..., -1] ** 2, axis=1), self.loss_scale)
+        K *= (np.sqrt(down) * keep)[:, None, None]
+        segment, N = _by_segment(K, i)
+        return Part(
+            kind, self.knots.middle(segment), segment, offsets, np.arange(gravity), N, float(np.sum(loss[keep])), 3 * int(keep.sum())
+        )
+
+    def _frames(self, x: JointState, steps: Steps, c: int) -> Iterator[Part]:
+        frames, camera, k = self.cameras[c], x.cameras[c], self.knots.order
+        i, u = self.knots.locate(frames.t + camera.dt)
+        value, rate = basis(self.knots, u), basis(self.knots, u, 1)
+        at = turning(x.R, steps, i, value, rate)
+        near = i[:, None] + np.arange(k)
+        position, velocity = (np.einsum("nl,nlk->nk", w, x.p[near]) for w in (value, rate))
+        RT = np.swapaxes(at.R, 1, 2)
+        T = camera.T_cam_imu @ se3.inverse(se3.make(at.R, position))
+        found = map_views(
+            frames.views, lambda rows: (rows, *corner_products(self.points, frames.views, rows, T[rows], camera.lens, self.loss_scale))
+        )
+        offsets = (KNOT * np.arange(k)[:, None] + np.arange(6)).ravel()
+        q, lens = len(offsets), len(camera.lens)
+        where = self.border.camera(c)
+        for rows, G, cost in found:
+            # A point's motion in the camera frame, by the knots, T_cam_imu and dt: rho' = rho - R^T dp, phi' = phi - dR in the IMU's.
+            f = len(G)
+            M = np.zeros((f, 6, q + 7))
+            by_knot = M[:, :, :q].reshape(f, 6, k, 6)
+            by_knot[:, :3, :, 3:] = -value[rows, None, :, None] * RT[rows, :, None, :]
+            by_knot[:, 3:, :, :3] = -at.dR[rows]
+            M[:, :, :q] = by_knot.reshape(f, 6, q)
+            M[:, :, q : q + 6] = np.eye(6)
+            M[:, :3, -1] = -(RT[rows] @ velocity[rows, :, None])[..., 0]
+            M[:, 3:, -1] = -at.omega[rows]
+            M = se3.adjoint(camera.T_cam_imu) @ M
+            chain = np.zeros((f, 6 + lens + 1, q + 7 + lens + 1))
+            chain[:, :6, : q + 7] = M
+            chain[:, np.arange(6, 6 + lens + 1), np.arange(q + 7, q + 7 + lens + 1)] = 1
+            N = np.swapaxes(chain, 1, 2) @ G @ chain
+            yield Part(
+                f"camera {c}",
+                (frames.t + camera.dt)[rows],
+                i[rows],
+                offsets,
+                np.arange(where.start, where.stop),
+                N,
+                cost,
+                2 * int(np.count_nonzero(frames.views.weight[rows])),
+            )
+
+    def _walk(self, x: JointState) -> Part:
+        """Biases walk: information 1 / (walk^2 h) ties each knot's to the next one's."""
+        m, scale = self.knots.controls, 1 / (self.imu.walk * np.sqrt(self.knots.spacing))
+        K = np.zeros((m - 1, 6, 13))
+        K[:, np.arange(6), np.arange(6)] = -scale
+        K[:, np.arange(6), np.arange(6, 12)] = scale
+        K[:, :, -1] = -scale * np.diff(x.bias, axis=0)
+        offsets = np.concatenate([np.arange(6, 12), KNOT + np.arange(6, 12)])
+        return _products("walk", self.knots, np.arange(m - 1), offsets, K)
+
+    def _stays(self, x: JointState, steps: Steps) -> Part:
+        """Neighbouring steps of rotation and position are alike to h^2 times a great acceleration: what bridges gaps of all sensors."""
+        m, h2 = self.knots.controls, self.knots.spacing**2
+        scale = np.repeat([1 / (h2 * _TURN_CHANGE), 1 / (h2 * _ACCELERATION)], 3)
+        K = np.zeros((m - 2, 6, 19))
+        for knot, factor in enumerate((1.0, -2.0, 1.0)):
+            K[:, np.arange(6), 6 * knot + np.arange(6)] = factor * scale
+        K[:, :3, -1] = -scale[:3] * np.diff(steps.d, axis=0)
+        K[:, 3:, -1] = -scale[3:] * np.diff(x.p, 2, axis=0)
+        offsets = (KNOT * np.arange(3)[:, None] + np.arange(6)).ravel()
+        return _products("stays", self.knots, np.arange(m - 2), offsets, K)
+
+
+def _products(kind: str, knots: Knots, first: Index, offsets: Index, K: Array) -> Part:
+    N = np.swapaxes(K, 1, 2) @ K
+    return Part(kind, knots.middle(first), first, offsets, np.arange(0), N, float(np.sum(K[..., -1] ** 2)), K.shape[0] * K.shape[1])
+
+
+def _by_segment(K: Array, i: Index) -> tuple[Index, Array]:
+    """Return the segments that rows K (n, 6, q) fall into, sorted, and K^T K of each."""
+    segment, row = np.unique(i, return_inverse=True)
+    count = np.bincount(row)
+    start = np.cumsum(count) - count
+    slot = np.arange(len(i)) - start[row]  # times are sorted
+    padded = np.zeros((len(segment), int(count.max()), *K.shape[1:]))
+    padded[row, slot] = K
+    padded = padded.reshape(len(segment), -1, K.shape[-1])
+    return segment, np.swapaxes(padded, 1, 2) @ padded

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import special
 
 from calibkit.estimation.hand_eye_data import HandEyeData, Mask
-from calibkit.estimation.hand_eye_normal import believed, normal
+from calibkit.estimation.hand_eye_normal import believed, inverse, normal
 from calibkit.geometry.so3 import Array
 
 ASSUMED_SIGMAS = (1e-3, 1e-3)  # rad, m: where the poses are too few to tell
@@ -118,14 +118,14 @@ def told(kinds: Array, theta: Array, e: Array, spread: Array, beside: tuple[floa
     theta_k <- theta_k (sum e^T C^-1 G_k C^-1 e) / (sum tr(Pi G_k)), Pi = C^-1 - C^-1 J cov J^T C^-1, with `spread` J cov J^T (n, 6, 6).
     `beside` is the sum of squares of one sigma, and their number, of other residuals that the last kind is the noise of.
     """
-    W = np.linalg.inv(weighed(kinds, theta))
+    W = inverse(weighed(kinds, theta))
     # What the fit has not taken: a share that hardly changes, and that is 0 to rounding where a kind of noise is all taken.
     left = np.maximum(np.einsum("nij,nkij->k", W - W @ spread @ W, kinds) / np.einsum("nij,nkij->k", W, kinds), 1e-3)
     squares, number = np.zeros(len(theta)), np.zeros(len(theta))
     if beside is not None:
         squares[-1], number[-1] = beside
     for _ in range(2):
-        W = np.linalg.inv(weighed(kinds, theta))
+        W = inverse(weighed(kinds, theta))
         We = W @ e[:, :, None]
         found = np.einsum("nij,nkij->k", We @ np.swapaxes(We, 1, 2), kinds) + squares / theta**2
         theta = theta * found / (left * np.einsum("nij,nkij->k", W, kinds) + number / theta) + 1e-3 * _FINEST

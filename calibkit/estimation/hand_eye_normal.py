@@ -25,7 +25,7 @@ class Normal:
 
     S: Array  # (6, 6)
     gradient: Array  # (6,)
-    A: Array  # (n_worlds, 6, 6) information about each Z given X
+    cov_Z: Array  # (n_worlds, 6, 6) of each Z given X
     follow: Array  # (n_worlds, 6, 6) d z_w / d x
     apart: Array  # (n_worlds, 6) z_w for x = 0
     J_Z: Array  # (n, 6, 6) Ad(M^-1)
@@ -49,7 +49,7 @@ class Normal:
     def spread_parts(self, data: HandEyeData, at: Index | slice = slice(None)) -> tuple[Array, Array]:
         """Return the covariance (k, 6, 6) of the fitted e_i of the poses `at`, by z_w given x and by x."""
         J_Z, J_X = self.J_Z[at], self.J_X[at]
-        by_world = J_Z @ np.linalg.inv(self.A)[data.world[at]] @ np.swapaxes(J_Z, 1, 2)
+        by_world = J_Z @ self.cov_Z[data.world[at]] @ np.swapaxes(J_Z, 1, 2)
         return by_world, J_X @ self.cov @ np.swapaxes(J_X, 1, 2)
 
     def step(self, data: HandEyeData, e: Array) -> tuple[Array, Array, Array]:
@@ -64,24 +64,39 @@ class Normal:
         return replace(normal(data, M, C, e, kept), free=self.free).step(data, e)
 
 
+def inverse(C: Array) -> Array:
+    """Return the inverses of covariances (n, k, k) by Gauss and Jordan, all at once: a third of the time of as many calls of LAPACK.
+
+    It takes the diagonal's pivots, which is stable where a matrix is positive definite (Higham 2002, section 14.4).
+    """
+    W = np.array(np.moveaxis(C, 0, -1), order="C")
+    for k in range(len(W)):
+        column, pivot = W[:, k].copy(), W[k, k].copy()
+        if not pivot.all():
+            raise np.linalg.LinAlgError("Singular matrix")
+        row = W[k] / pivot
+        W -= column[:, None] * row
+        W[k], W[:, k], W[k, k] = row, -column / pivot, 1 / pivot
+    return np.ascontiguousarray(np.moveaxis(W, -1, 0))
+
+
 def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Normal:
     """Return the normal equations of e = -x + Ad(M^-1) z.
 
     A world with fewer than two kept poses says nothing of X; its Z is that of all its poses.
     """
-    W = np.asarray(np.linalg.inv(C), np.float64)
+    W = inverse(C)
     J_Z = se3.adjoint(se3.inverse(M))
     active = (np.bincount(data.world, kept, data.n_worlds) >= 2)[data.world]
-    JW = np.swapaxes(J_Z, 1, 2) @ W * (kept | ~active)[:, None, None]
-    A = data.sum_by_world(JW @ J_Z) + np.diag(_FAR)
-    right = data.sum_by_world(np.concatenate([JW, JW @ e[:, :, None]], axis=2))
-    solved = np.asarray(np.linalg.solve(A, right), np.float64)
-    follow, apart = solved[:, :, :6], solved[:, :, 6]
+    WJ = W @ J_Z * (kept | ~active)[:, None, None]
+    cov_Z = inverse(data.sum_by_world(np.swapaxes(J_Z, 1, 2) @ WJ) + np.diag(_FAR))
+    follow = cov_Z @ np.swapaxes(data.sum_by_world(WJ), 1, 2)
+    apart = (cov_Z @ data.sum_by_world(np.swapaxes(WJ, 1, 2) @ e[:, :, None]))[:, :, 0]
     J_X = J_Z @ follow[data.world] - np.eye(6)
-    RW = np.swapaxes(J_X, 1, 2) @ W * (kept & active)[:, None, None]
+    WJ = (W @ J_X * (kept & active)[:, None, None]).reshape(-1, 6)
     left = e - (J_Z @ apart[data.world][:, :, None])[:, :, 0]
-    S = np.sum(RW @ J_X, axis=0) + np.diag(_FAR)
-    return Normal((S + S.T) / 2, np.einsum("nij,nj->i", RW, left), A, follow, apart, J_Z, J_X, W, active, np.zeros((6, 0)))
+    S = WJ.T @ J_X.reshape(-1, 6) + np.diag(_FAR)
+    return Normal((S + S.T) / 2, WJ.T @ left.reshape(-1), cov_Z, follow, apart, J_Z, J_X, W, active, np.zeros((6, 0)))
 
 
 def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal, chance: bool = True) -> tuple[Array, Normal]:

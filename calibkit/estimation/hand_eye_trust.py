@@ -48,7 +48,7 @@ def judge(data: HandEyeData, fit: Refined) -> Trust:
     largest = int(np.argmax(np.bincount(data.world, fit.kept, data.n_worlds)))
     follow = np.concatenate([np.eye(6), system.follow[largest]])
     both = follow @ known @ follow.T
-    both[6:, 6:] += np.linalg.inv(system.A[largest])
+    both[6:, 6:] += system.cov_Z[largest]
     leaves_open = open_directions(data, fit.X, cov[X, X])
     advice = advise(data, fit, both, largest) if leaves_open else ()
     return Trust(cov[X, X], plain[X, X], cov[Z, Z], plain[Z, Z], leaves_open, advice, both, inflation)
@@ -73,7 +73,7 @@ def _sandwich(data: HandEyeData, fit: Refined, system: Normal) -> tuple[Array, A
         back = np.block([[free, np.zeros((6, 6))], [np.zeros((6, k)), np.diag(SCALES)]])
     else:
         J, back = system.J_X[used] @ free, np.concatenate([free, system.follow[0] @ free])
-        given_x[6:, 6:] = np.linalg.inv(system.A[0])
+        given_x[6:, 6:] = system.cov_Z[0]
     if J.shape[2] == 0 or len(used) == 0:
         return given_x, given_x
     JW = np.swapaxes(J, 1, 2) @ system.W[used]

@@ -10,18 +10,19 @@ from calibkit.estimation.camera_problem import CameraViews
 from calibkit.estimation.joint_noise import draw
 from calibkit.estimation.joint_parts import projected
 from calibkit.estimation.joint_problem import Frames, GravityPrior, ImuRows, JointProblem
-from calibkit.estimation.joint_state import KNOT, CameraState, JointState
+from calibkit.estimation.joint_state import EXTRAS, KNOT, CameraState, JointState
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
 from calibkit.models.cameras import CAMERAS
+from calibkit.models.imu import ImuModel
 from calibkit.solver.banded import Banded
 
 LENS = np.array([461.2, 459.8, 366.7, 247.9, -0.28, 0.07, 2e-4, 2e-5])
 KINDS = ("gyro", "accel", "camera 0", "camera 1", "walk", "stays")
 
 
-def small(order: int = 4, seed: int = 0) -> tuple[JointProblem, JointState]:
+def small(order: int = 4, extras: tuple[str, ...] = (), seed: int = 0) -> tuple[JointProblem, JointState]:
     """Return a problem of a few knots with two cameras, measurements that nothing fits, and a state."""
     rng = np.random.default_rng(seed)
     knots = Knots(0.0, 0.1, order, 8)
@@ -46,8 +47,16 @@ def small(order: int = 4, seed: int = 0) -> tuple[JointProblem, JointState]:
         cameras.append(Frames(rng.uniform(0.05, 0.7, f), CameraViews(CAMERAS["pinhole-radtan"], np.arange(f), uv, weight, (752, 480))))
         T = se3.make(so3.exp(0.1 * rng.standard_normal(3)), 0.05 * rng.standard_normal(3))
         states.append(CameraState(T, 0.02 * rng.standard_normal(), LENS * (1 + 0.01 * rng.standard_normal(8))))
-    problem = JointProblem(knots, points, imu, tuple(cameras), GravityPrior(9.8, 0.02), lens_priors=(None, (LENS, np.diag(1 / LENS**2))))
-    return problem, JointState(R, p, 0.1 * rng.standard_normal((m, 6)), tuple(states), np.array([0.3, -9.0, 2.0]))
+    problem = JointProblem(
+        knots, points, imu, tuple(cameras), GravityPrior(9.8, 0.02), lens_priors=(None, (LENS, np.diag(1 / LENS**2))), extras=extras
+    )
+    model = ImuModel(
+        M_a=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
+        M_g=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
+        C_g_i=so3.exp(0.1 * rng.standard_normal(3)),
+        A_g=0.01 * rng.standard_normal((3, 3)),
+    )
+    return problem, JointState(R, p, 0.1 * rng.standard_normal((m, 6)), tuple(states), np.array([0.3, -9.0, 2.0]), 1.05, model)
 
 
 def cost_of(problem: JointProblem, kind: str) -> Callable[[JointState], float]:
@@ -67,10 +76,11 @@ def gradient_of(problem: JointProblem, x: JointState, kind: str) -> tuple[Array,
 
 
 @pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("extras", [(), tuple(EXTRAS)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_jacobians_are_those_of_differences(order: int, kind: str) -> None:
+def test_the_jacobians_are_those_of_differences(order: int, extras: tuple[str, ...], kind: str) -> None:
     """d cost = -2 (J^T r) d for single unknowns of every sort: residuals are far from 0, so a wrong J shows."""
-    problem, x = small(order)
+    problem, x = small(order, extras)
     core, border = gradient_of(problem, x, kind)
     cost, m, p = cost_of(problem, kind), problem.knots.controls, problem.border.size
     # The walk of turns (stays) takes d log(R^T R') for the difference of perturbations: right for small steps only.

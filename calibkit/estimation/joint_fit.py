@@ -50,16 +50,15 @@ def fit_joint(problem: JointProblem, x: JointState) -> JointFit:
         solution = minimise(replace(problem, loss_scale=_LOSS), solution.x, max_steps=6, tolerance=1e-4)
         steps += solution.steps
     problem = _without_outliers(problem, solution.x, found, factors)
-    for _ in range(_ROUNDS):
-        solution = minimise(problem, solution.x, max_steps=20, tolerance=1e-8)
+    for rest in reversed(range(_ROUNDS)):
+        solution = minimise(problem, solution.x, max_steps=20, tolerance=1e-4 if rest else 1e-8)
         steps += solution.steps
         _, system = problem.linearize(solution.x)
         drawn = draw(system, DRAWS)
         parts = components(problem, solution.x, drawn)
         scales = {kind: part.factor for kind, part in parts.items() if kind not in ("walk", "stays")}
-        if all(abs(scale - 1) < _SETTLED for scale in scales.values()):
-            break
-        problem = _rescaled(problem, scales, factors)
+        if rest:
+            problem = _rescaled(problem, scales, factors)
     return JointFit(problem, solution.x, system, drawn, tuple(weight > 0 for weight in found), factors, parts, solution.converged, steps)
 
 

@@ -1,7 +1,7 @@
 """The joint estimator as one least-squares problem: corners, gyroscope, accelerometer and bias walks on one continuous-time trajectory.
 
-gyro   w_meas - (omega(t) + b_g)
-accel  a_meas - (R(t)^T (p''(t) - g) + b_a)
+gyro   w_meas - (M_g C_g_i omega(t) + A_g C_g_i f_meas + b_g)
+accel  a_meas - (M_a R(t)^T (s p''(t) - g) + b_a)            s: the board's size over what its file says
 corner uv - project(T_cam_imu T_world_imu(t + dt)^-1 P; lens)
 walk   b_{j+1} - b_j ~ N(0, walk^2 h)
 (Furgale, Rehder, Siegwart 2013; the trajectory as in `geometry.spline`.)
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.estimation.camera_problem import CameraViews, corner_products, map_views
+from calibkit.estimation.camera_problem import CameraViews, Shutter, corner_products, map_views
 from calibkit.estimation.joint_parts import Index, Part, assemble
-from calibkit.estimation.joint_state import GRAVITY, KNOT, Border, JointState, retract
+from calibkit.estimation.joint_state import A_G, EXTRAS, KNOT, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE, Border, JointState, retract
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots, Steps, basis, turning
@@ -26,6 +26,7 @@ from calibkit.solver.robust import cauchy
 _CHUNK = 4000  # IMU samples worked on at once: memory stays flat
 # A trajectory that nothing measures stays as it moves: what moves more than this has sensors of its own to say so.
 _TURN_CHANGE, _ACCELERATION = 200.0, 100.0  # rad/s^2, m/s^2
+EXTRAS_OF_IMU = {name: size for name, size in EXTRAS.items() if name != LINE}
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,14 @@ class JointProblem:
     gravity: GravityPrior
     loss_scale: float = np.inf  # Cauchy's, in sigmas
     lens_priors: tuple[tuple[Array, Array] | None, ...] = ()  # lens and information (l, l) of each camera, where it is known
+    extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
 
     @property
     def border(self) -> Border:
-        return Border(tuple(len(frames.views.model.parameter_names) for frames in self.cameras))
+        return Border(tuple(len(frames.views.model.parameter_names) for frames in self.cameras), self.extras)
 
     def retract(self, x: JointState, core: Array, border: Array) -> JointState:
-        return retract(x, core, border)
+        return retract(x, self.border, core, border)
 
     def linearize(self, x: JointState) -> tuple[float, Arrowhead]:
         cost, system = assemble(self.parts(x), self.knots.controls, self.knots.order, self.border.size)
@@ -85,11 +87,12 @@ class JointProblem:
         size = float(np.linalg.norm(x.gravity))
         J = x.gravity / size / self.gravity.sigma
         r = (self.gravity.size - size) / self.gravity.sigma
-        C[GRAVITY, GRAVITY], g[GRAVITY] = np.outer(J, J), J * r
+        where = self.border["gravity"]
+        C[where, where], g[where] = np.outer(J, J), J * r
         cost = r * r
         for c, prior in enumerate(self.lens_priors):
             if prior is not None:
-                where, (lens, information) = self.border.lens(c), prior
+                where, (lens, information) = self.border[f"lens {c}"], prior
                 off = lens - x.cameras[c].lens
                 C[where, where], g[where] = information, information @ off
                 cost += float(off @ information @ off)
@@ -114,9 +117,16 @@ class JointProblem:
         value, rate, second = (basis(self.knots, u, r) for r in range(3))
         near = i[:, None] + np.arange(self.knots.order)
         at = turning(x.R, steps, i, value, rate, jacobians=False)
-        force = np.einsum("nji,nj->ni", at.R, np.einsum("nl,nlk->nk", second, x.p[near]) - x.gravity)
-        predicted = np.concatenate([at.omega, force], axis=1) + x.bias[i]
-        return np.concatenate([self.imu.gyro, self.imu.accel], axis=1) - predicted
+        acceleration = np.einsum("nl,nlk->nk", second, x.p[near])
+        force = np.einsum("nji,nj->ni", at.R, x.board_scale * acceleration - x.gravity)
+        accel = force @ x.imu.M_a.T + x.bias[i, 3:]
+        gyro = at.omega @ (x.imu.M_g @ x.imu.C_g_i).T + self._felt(x, slice(None)) @ (x.imu.A_g @ x.imu.C_g_i).T + x.bias[i, :3]
+        return np.concatenate([self.imu.gyro - gyro, self.imu.accel - accel], axis=1)
+
+    def _felt(self, x: JointState, rows: slice) -> Array:
+        """Return the specific force that samples felt (n, 3): as measured, its noise is nothing to A_g."""
+        felt: Array = self.imu.accel[rows] @ np.linalg.inv(x.imu.M_a).T
+        return felt
 
     def _imu(self, x: JointState, steps: Steps, rows: slice) -> tuple[Part, Part]:
         """Return what some samples of gyroscope and accelerometer say."""
@@ -126,38 +136,51 @@ class JointProblem:
         at = turning(x.R, steps, i, value, rate)
         RT = np.swapaxes(at.R, 1, 2)
         acceleration = np.einsum("nl,nlk->nk", second, x.p[i[:, None] + np.arange(k)])
-        force = (RT @ (acceleration - x.gravity)[..., None])[..., 0]
-        n, bias = len(i), x.bias[i]
+        force = (RT @ (x.board_scale * acceleration - x.gravity)[..., None])[..., 0]
+        n, bias, model = len(i), x.bias[i], x.imu
+        where = self.border.of_imu
+        free = {name: np.zeros((n, 3, size)) for name, size in EXTRAS_OF_IMU.items() if name in self.extras}
 
+        turns, sensitive, felt = model.M_g @ model.C_g_i, model.A_g @ model.C_g_i, self._felt(x, rows)
+        extra = {"gravity": np.zeros((n, 3, 3)), **free}
+        if M_G in free:
+            extra[M_G] = by_lower(at.omega @ model.C_g_i.T)
+        if PHI in free:
+            extra[PHI] = -turns @ so3.hat(at.omega) - sensitive @ so3.hat(felt)
+        if M_A in free:
+            extra[M_A] = -sensitive @ np.linalg.inv(model.M_a) @ by_lower(felt)
+        if A_G in free:
+            extra[A_G] = np.einsum("rs,nc->nrsc", np.eye(3), felt @ model.C_g_i.T).reshape(n, 3, 9)
         rotation = KNOT * np.arange(k)[:, None] + np.arange(3)
-        K = np.empty((n, 3, 3 * k + 3 + 1))
-        K[:, :, :3], K[:, :, 6:-1] = at.domega[:, :, 0], at.domega[:, :, 1:].reshape(n, 3, -1)
-        K[:, :, 3:6] = np.eye(3)
-        K[:, :, -1] = imu.gyro[rows] - at.omega - bias[:, :3]
+        by_knot = turns @ at.domega.reshape(n, 3, -1)
+        left = self.imu.gyro[rows] - at.omega @ turns.T - felt @ sensitive.T - bias[:, :3]
+        K = np.concatenate([by_knot[..., :3], _eyes(n), by_knot[..., 3:], *extra.values(), left[..., None]], axis=2)
         offsets = np.concatenate([rotation[0], np.arange(6, 9), rotation[1:].ravel()])
-        gyro = self._samples("gyro", K, imu.sigma[:3], imu.keep[rows, 0], i, offsets, 0)
+        gyro = self._samples("gyro", K, imu.sigma[:3], imu.keep[rows, 0], i, offsets, where)
 
         motion = KNOT * np.arange(1, k)[:, None] + np.arange(6)
         by_knot = np.empty((n, 3, k, 6))
         by_knot[..., :3] = np.einsum("nab,nbkc->nakc", so3.hat(force), at.dR)
-        by_knot[..., 3:] = second[:, None, :, None] * RT[:, :, None, :]
-        K = np.empty((n, 3, 6 * k + 3 + 3 + 1))
-        K[:, :, :6], K[:, :, 9 : 6 * k + 3] = by_knot[:, :, 0], by_knot[:, :, 1:].reshape(n, 3, -1)
-        K[:, :, 6:9] = np.eye(3)
-        K[:, :, -4:-1] = -RT
-        K[:, :, -1] = imu.accel[rows] - force - bias[:, 3:]
+        by_knot[..., 3:] = x.board_scale * second[:, None, :, None] * RT[:, :, None, :]
+        extra = {"gravity": -model.M_a @ RT, **free}
+        if SCALE in free:
+            extra[SCALE] = model.M_a @ RT @ acceleration[..., None]
+        if M_A in free:
+            extra[M_A] = by_lower(force)
+        by_knot = model.M_a @ by_knot.reshape(n, 3, -1)
+        left = self.imu.accel[rows] - force @ model.M_a.T - bias[:, 3:]
+        K = np.concatenate([by_knot[..., :6], _eyes(n), by_knot[..., 6:], *extra.values(), left[..., None]], axis=2)
         offsets = np.concatenate([np.arange(6), np.arange(9, 12), motion.ravel()])
-        return gyro, self._samples("accel", K, imu.sigma[3:], imu.keep[rows, 1], i, offsets, GRAVITY.stop)
+        return gyro, self._samples("accel", K, imu.sigma[3:], imu.keep[rows, 1], i, offsets, where)
 
-    def _samples(self, kind: str, K: Array, sigma: Array, keep: NDArray[np.bool_], i: Index, offsets: Index, gravity: int) -> Part:
+    def _samples(self, kind: str, K: Array, sigma: Array, keep: NDArray[np.bool_], i: Index, offsets: Index, where: slice) -> Part:
         """Return the products of rows K (n, 3, q), weighed, by the segments i that they fall into."""
         K /= sigma[:, None]
         loss, down = cauchy(np.sum(K[..., -1] ** 2, axis=1), self.loss_scale)
         K *= (np.sqrt(down) * keep)[:, None, None]
         segment, N = _by_segment(K, i)
-        return Part(
-            kind, self.knots.middle(segment), segment, offsets, np.arange(gravity), N, float(np.sum(loss[keep])), 3 * int(keep.sum())
-        )
+        touch, cost = np.arange(where.start, where.stop), float(np.sum(loss[keep]))
+        return Part(kind, self.knots.middle(segment), segment, offsets, touch, N, cost, 3 * int(keep.sum()))
 
     def _frames(self, x: JointState, steps: Steps, c: int) -> Iterator[Part]:
         frames, camera, k = self.cameras[c], x.cameras[c], self.knots.order
@@ -167,39 +190,33 @@ class JointProblem:
         near = i[:, None] + np.arange(k)
         position, velocity = (np.einsum("nl,nlk->nk", w, x.p[near]) for w in (value, rate))
         RT = np.swapaxes(at.R, 1, 2)
+        # A point's motion in the camera frame, by the knots, T_cam_imu and dt: rho - R^T dp and phi - dR in the IMU's.
+        into = se3.adjoint(camera.T_cam_imu)
         T = camera.T_cam_imu @ se3.inverse(se3.make(at.R, position))
-        found = map_views(
-            frames.views, lambda rows: (rows, *corner_products(self.points, frames.views, rows, T[rows], camera.lens, self.loss_scale))
-        )
+        twist = -np.concatenate([(RT @ velocity[..., None])[..., 0], at.omega], axis=1) @ into.T
+        by_knot = np.zeros((len(i), 6, k, 6))
+        by_knot[:, :3, :, 3:] = -value[:, None, :, None] * RT[:, :, None, :]
+        by_knot[:, 3:, :, :3] = -at.dR
+        motion = np.concatenate([into @ by_knot.reshape(len(i), 6, -1), np.broadcast_to(into, (len(i), 6, 6)), twist[..., None]], axis=2)
+
+        def products(rows: slice) -> tuple[slice, Array, float]:
+            shutter = None
+            if LINE in self.extras:
+                row = frames.views.uv[rows, :, 1] - (frames.views.image_size[1] - 1) / 2
+                shutter = Shutter(twist[rows], camera.line_delay * row, LINE_SCALE * row)
+            return rows, *corner_products(self.points, frames.views, rows, T[rows], camera.lens, self.loss_scale, shutter)
+
         offsets = (KNOT * np.arange(k)[:, None] + np.arange(6)).ravel()
-        q, lens = len(offsets), len(camera.lens)
         where = self.border.camera(c)
-        for rows, G, cost in found:
-            # A point's motion in the camera frame, by the knots, T_cam_imu and dt: rho' = rho - R^T dp, phi' = phi - dR in the IMU's.
-            f = len(G)
-            M = np.zeros((f, 6, q + 7))
-            by_knot = M[:, :, :q].reshape(f, 6, k, 6)
-            by_knot[:, :3, :, 3:] = -value[rows, None, :, None] * RT[rows, :, None, :]
-            by_knot[:, 3:, :, :3] = -at.dR[rows]
-            M[:, :, :q] = by_knot.reshape(f, 6, q)
-            M[:, :, q : q + 6] = np.eye(6)
-            M[:, :3, -1] = -(RT[rows] @ velocity[rows, :, None])[..., 0]
-            M[:, 3:, -1] = -at.omega[rows]
-            M = se3.adjoint(camera.T_cam_imu) @ M
-            chain = np.zeros((f, 6 + lens + 1, q + 7 + lens + 1))
-            chain[:, :6, : q + 7] = M
-            chain[:, np.arange(6, 6 + lens + 1), np.arange(q + 7, q + 7 + lens + 1)] = 1
+        for rows, G, cost in map_views(frames.views, products):
+            f, moving, others = len(G), motion.shape[-1], G.shape[-1] - 6
+            chain = np.zeros((f, 6 + others, moving + others))
+            chain[:, :6, :moving] = motion[rows]
+            chain[:, np.arange(6, 6 + others), np.arange(moving, moving + others)] = 1
             N = np.swapaxes(chain, 1, 2) @ G @ chain
-            yield Part(
-                f"camera {c}",
-                (frames.t + camera.dt)[rows],
-                i[rows],
-                offsets,
-                np.arange(where.start, where.stop),
-                N,
-                cost,
-                2 * int(np.count_nonzero(frames.views.weight[rows])),
-            )
+            corners = int(np.count_nonzero(frames.views.weight[rows]))
+            t, touch = (frames.t + camera.dt)[rows], np.arange(where.start, where.stop)
+            yield Part(f"camera {c}", t, i[rows], offsets, touch, N, cost, 2 * corners)
 
     def _walk(self, x: JointState) -> Part:
         """Biases walk: information 1 / (walk^2 h) ties each knot's to the next one's."""
@@ -222,6 +239,18 @@ class JointProblem:
         K[:, 3:, -1] = -scale[3:] * np.diff(x.p, 2, axis=0)
         offsets = (KNOT * np.arange(3)[:, None] + np.arange(6)).ravel()
         return _products("stays", self.knots, np.arange(m - 2), offsets, K)
+
+
+def _eyes(n: int) -> Array:
+    return np.broadcast_to(np.eye(3), (n, 3, 3))
+
+
+def by_lower(v: Array) -> Array:
+    """Return d(M v) / d(M's six values) (n, 3, 6) for v (n, 3) and M lower triangular, row by row."""
+    out = np.zeros((len(v), 3, 6))
+    rows, columns = np.tril_indices(3)
+    out[:, rows, np.arange(6)] = v[:, columns]
+    return out
 
 
 def _products(kind: str, knots: Knots, first: Index, offsets: Index, K: Array) -> Part:

@@ -1,13 +1,15 @@
 """The unknowns of the joint estimator: a trajectory with biases on its knots (the core), cameras and gravity (the border)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
+from calibkit.models.imu import ImuModel, lower
 
 KNOT = 12  # unknowns of a knot: rotation, position, gyroscope's bias, accelerometer's bias
 ROTATION, POSITION, BIASES = slice(0, 3), slice(3, 6), slice(6, 12)
-GRAVITY = slice(0, 3)  # of the border
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,7 @@ class CameraState:
     T_cam_imu: Array  # (4, 4)
     dt: float  # s
     lens: Array  # (l,)
+    line_delay: float = 0.0  # s from one row to the next; stamps are the middle row's
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,14 @@ class JointState:
     bias: Array  # (m, 6) rad/s, m/s^2
     cameras: tuple[CameraState, ...]
     gravity: Array  # (3,) m/s^2 in the board's frame, pointing down
+    board_scale: float = 1.0  # of the board over what its file says
+    imu: ImuModel = field(default_factory=ImuModel)  # its biases are not used: they are on the knots
+
+
+# What is free on request, and what is suspected where it is not: names with the number of unknowns.
+SCALE, M_A, M_G, PHI, A_G, LINE = "board scale", "M_a", "M_g", "phi_g_i", "A_g", "line delay"
+EXTRAS = {SCALE: 1, M_A: 6, M_G: 6, PHI: 3, A_G: 9, LINE: 1}
+LINE_SCALE = 1e-3  # the unknown of a line delay is its delay of a thousand rows
 
 
 @dataclass(frozen=True)
@@ -35,36 +46,69 @@ class Border:
     """Where each calibration parameter stands."""
 
     lens_sizes: tuple[int, ...]
+    extras: tuple[str, ...] = ()
+
+    @property
+    def _blocks(self) -> dict[str, slice]:
+        sizes = {"gravity": 3, **{name: size for name, size in EXTRAS.items() if name in self.extras and name != LINE}}
+        for c, lens in enumerate(self.lens_sizes):
+            sizes |= {f"T {c}": 6, f"dt {c}": 1, f"lens {c}": lens, **({f"{LINE} {c}": 1} if LINE in self.extras else {})}
+        out, start = {}, 0
+        for name, size in sizes.items():
+            out[name] = slice(start, start := start + size)
+        return out
+
+    def __getitem__(self, name: str) -> slice:
+        """Return where "gravity", an extra of the IMU, or "T c", "dt c", "lens c", "line delay c" of camera c stands."""
+        return self._blocks[name]
 
     def camera(self, c: int) -> slice:
-        """Return T_cam_imu (rho, phi), dt and lens of camera c."""
-        start = GRAVITY.stop + sum(7 + size for size in self.lens_sizes[:c])
-        return slice(start, start + 7 + self.lens_sizes[c])
+        """Return T_cam_imu (rho, phi), dt, lens and line delay of camera c."""
+        last = f"{LINE if LINE in self.extras else 'lens'} {c}"
+        return slice(self[f"T {c}"].start, self[last].stop)
 
-    def pose(self, c: int) -> slice:
-        return slice(self.camera(c).start, self.camera(c).start + 6)
-
-    def dt(self, c: int) -> int:
-        return int(self.camera(c).start) + 6
-
-    def lens(self, c: int) -> slice:
-        return slice(self.camera(c).start + 7, self.camera(c).stop)
+    @property
+    def of_imu(self) -> slice:
+        """Return gravity and what is free of the IMU and of the board's size."""
+        return slice(0, self["T 0"].start)
 
     @property
     def size(self) -> int:
         return int(self.camera(len(self.lens_sizes) - 1).stop)
 
 
-def retract(x: JointState, core: Array, border: Array) -> JointState:
+def retract(x: JointState, where: Border, core: Array, border: Array) -> JointState:
     """Return the state moved by steps of the core (m, 12) and the border (p,)."""
-    where = Border(tuple(len(camera.lens) for camera in x.cameras))
+
+    def step(name: str) -> Array:
+        return border[where[name]]
+
     cameras = tuple(
         CameraState(
-            se3.retract(camera.T_cam_imu, border[where.pose(c)]),
-            camera.dt + float(border[where.dt(c)]),
-            camera.lens + border[where.lens(c)],
+            se3.retract(camera.T_cam_imu, step(f"T {c}")),
+            camera.dt + float(step(f"dt {c}")[0]),
+            camera.lens + step(f"lens {c}"),
+            camera.line_delay + (LINE_SCALE * float(step(f"{LINE} {c}")[0]) if LINE in where.extras else 0.0),
         )
         for c, camera in enumerate(x.cameras)
     )
-    R = so3.project(x.R @ so3.exp(core[:, ROTATION]))
-    return replace(x, R=R, p=x.p + core[:, POSITION], bias=x.bias + core[:, BIASES], cameras=cameras, gravity=x.gravity + border[GRAVITY])
+    moved = {name: step(name) for name in where.extras if name != LINE}
+    imu = replace(
+        x.imu,
+        M_a=x.imu.M_a + lower(moved.get(M_A, _NO_6)),
+        M_g=x.imu.M_g + lower(moved.get(M_G, _NO_6)),
+        C_g_i=x.imu.C_g_i @ so3.exp(moved.get(PHI, _NO_3)),
+        A_g=x.imu.A_g + moved.get(A_G, _NO_9).reshape(3, 3),
+    )
+    return JointState(
+        R=so3.project(x.R @ so3.exp(core[:, ROTATION])),
+        p=x.p + core[:, POSITION],
+        bias=x.bias + core[:, BIASES],
+        cameras=cameras,
+        gravity=x.gravity + step("gravity"),
+        board_scale=x.board_scale + float(moved.get(SCALE, _NO_3)[0]),
+        imu=imu,
+    )
+
+
+_NO_3, _NO_6, _NO_9 = np.zeros(3), np.zeros(6), np.zeros(9)

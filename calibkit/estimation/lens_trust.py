@@ -65,19 +65,25 @@ def _bias_covariance(fit: LensFit) -> Array:
 
 
 def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:
-    """Return what each border parameter must be known to.
+    """Return what each border parameter must be known to: lenses by `lens_scales`, transforms 1 mm and 1 mrad."""
+    scales = np.empty(problem.border_size)
+    for views, lens, where in zip(problem.cameras, lenses, problem.lens_slices, strict=True):
+        scales[where] = lens_scales(views, lens)
+    for c in range(1, len(problem.cameras)):
+        scales[problem.rig_slice(c)] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
+    return scales
+
+
+def lens_scales(views: CameraViews, lens: Array) -> Array:
+    """Return what each parameter of a lens must be known to.
 
     1 px of focal length and centre; of each coefficient what moves a pixel by 1 px where the outermost corners were (at the edge of
     what was seen: the 99th percentile of |duv/dk| over the corners).
     """
-    scales = np.empty(problem.border_size)
-    for views, lens, where in zip(problem.cameras, lenses, problem.lens_slices, strict=True):
-        J = _corner_jacobians(views, lens)
-        effect = np.percentile(np.linalg.norm(J, axis=-2), _OUTERMOST, axis=0) if len(J) else np.ones(len(lens))
-        effect[:4] = 1.0
-        scales[where] = SCALES["px"] / np.maximum(effect, 1e-9)
-    for c in range(1, len(problem.cameras)):
-        scales[problem.rig_slice(c)] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
+    J = _corner_jacobians(views, lens)
+    effect = np.percentile(np.linalg.norm(J, axis=-2), _OUTERMOST, axis=0) if len(J) else np.ones(len(lens))
+    effect[:4] = 1.0
+    scales: Array = SCALES["px"] / np.maximum(effect, 1e-9)
     return scales
 
 

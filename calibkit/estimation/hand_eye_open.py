@@ -1,60 +1,14 @@
-"""What the poses leave open of X: the directions that are weak or not observable, in words."""
+"""What the poses leave open of X, in words."""
 
-from dataclasses import dataclass
-
-import numpy as np
-
+from calibkit.estimation import open_directions as transform
 from calibkit.estimation.hand_eye_data import HandEyeData
-from calibkit.estimation.hand_eye_normal import SCALES
+from calibkit.estimation.open_directions import Open
 from calibkit.geometry.so3 import Array
-from calibkit.solver import trust
 
-_PURE = 0.1  # of a direction of unit length: less than this is not in it
-_SAME_AXIS = 0.98
-
-
-@dataclass(frozen=True)
-class Open:
-    """A direction of X that the poses tell little or nothing of."""
-
-    text: str  # "p of T_gripper_cam along the gripper's (0.1, 0.9, 0.3)"
-    sigma: float  # in 1 mm and 1 mrad
-    grade: trust.Grade
-    vector: Array  # (6,) of unit length in X's right tangent, m and rad
+__all__ = ["Open", "open_directions"]
 
 
 def open_directions(data: HandEyeData, X: Array, cov_X: Array) -> tuple[Open, ...]:
-    """Return what is not observable and what is weak, in words, the weakest first."""
-    found = trust.directions(cov_X, SCALES)
-    out: list[Open] = []
-    for grade in ("not observable", "weak"):
-        those = [d for d in found if d.grade == grade]
-        if those:
-            out += _named(data, X, np.stack([d.vector for d in those], axis=1), cov_X, grade)
-    return tuple(out)
-
-
-def _named(data: HandEyeData, X: Array, basis: Array, cov_X: Array, grade: trust.Grade) -> list[Open]:
-    """Return the directions of a subspace (6, k) apart: those of p alone, and turns, with p where it goes with them."""
+    """Return what is not observable and what is weak of X = T_1_2, in frame 1's axes."""
     one, two, _, _ = data.words.frames
-    name, R = f"T_{one}_{two}", X[:3, :3]
-    _, s, Vt = np.linalg.svd(basis[3:])
-    columns, turns = (basis @ Vt.T).T, np.append(s, np.zeros(len(Vt)))[: len(Vt)] > _PURE
-    p_alone = columns[~turns, :3]
-    # What p alone may do anyway is no part of a turn.
-    across = np.eye(3) - p_alone.T @ np.linalg.pinv(p_alone.T)
-    out = []
-    for v, turn in zip(columns, turns, strict=True):
-        follows = ", and p with it" if np.linalg.norm(across @ v[:3]) > _PURE else ""
-        text = f"R of {name} about {_axis_of(one, R @ v[3:])}{follows}" if turn else f"p of {name} along {_axis_of(one, R @ v[:3])}"
-        out.append(Open(text, float(np.sqrt(v / SCALES @ cov_X @ (v / SCALES))), grade, v))
-    return sorted(out, key=lambda direction: -direction.sigma)
-
-
-def _axis_of(frame: str, v: Array) -> str:
-    v = v / max(float(np.linalg.norm(v)), 1e-300)
-    i = int(np.argmax(np.abs(v)))
-    if abs(v[i]) > _SAME_AXIS:
-        return f"the {frame}'s {'xyz'[i]} axis"
-    v = v * np.sign(v[i])
-    return f"the {frame}'s ({v[0]:.1f}, {v[1]:.1f}, {v[2]:.1f})".replace("-0.0", "0.0")
+    return transform.open_directions(f"T_{one}_{two}", one, X[:3, :3], cov_X)

@@ -11,7 +11,6 @@ from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.banded import Banded
 
 _THIRD = np.sqrt(20.0)  # sigma of a third difference of white noise
-_RAYLEIGH = 1.538  # median of the length of three normal numbers
 DRAWS = 3  # of the state; a trace of thousands is then known to 1 %
 
 
@@ -32,15 +31,21 @@ class Drawn:
     S: Array  # (p, p)
 
 
+def schur(system: Arrowhead) -> tuple[Array, Array]:
+    """Return A^-1 B (m 12, p) and S = C - B^T A^-1 B (p, p)."""
+    p = system.corner.shape[0]
+    answer = system.core.solve(system.border).reshape(-1, p)
+    S: Array = system.corner - system.border.reshape(-1, p).T @ answer
+    return answer, S
+
+
 def draw(system: Arrowhead, draws: int, seed: int = 0) -> Drawn:
     """Return draws dc ~ N(0, S^-1), dx = L^-T white - A^-1 B dc."""
     core = system.core
     assert isinstance(core, Banded)
     rng = np.random.default_rng(seed)
     size, p = core.ab.shape[1], system.corner.shape[0]
-    flat = system.border.reshape(size, p)
-    answer = core.solve(system.border).reshape(size, p)
-    S = system.corner - flat.T @ answer
+    answer, S = schur(system)
     values, vectors = np.linalg.eigh(S)
     root = vectors / np.sqrt(np.maximum(values, values[-1] * 1e-15))
     border = root @ rng.standard_normal((p, draws))

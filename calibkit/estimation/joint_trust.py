@@ -1,17 +1,47 @@
-"""How far the joint estimate may be trusted: its covariance with correlated residuals paid for."""
+"""How far the joint estimate may be trusted: its covariance with correlated residuals paid for, less what noise alone pretends."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibkit.estimation.joint_fit import JointFit
+from calibkit.estimation.joint_noise import schur
 from calibkit.estimation.joint_parts import projected
+from calibkit.estimation.joint_state import LINE, LINE_SCALE
 from calibkit.estimation.lens_trust import lens_scales
+from calibkit.estimation.open_directions import TRANSFORM_SCALES
 from calibkit.geometry.so3 import Array
+from calibkit.solver.banded import Banded
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _GRAVITY_SCALE = 0.01  # m/s^2: 1 mrad of its direction
+_KNOWN_AT_LEAST = 1e-6  # of the information of a direction: the others' share noise pretends
 
 
-def joint_covariance(fit: JointFit) -> Covariance:
+@dataclass(frozen=True)
+class Trust:
+    """Covariance of the border and where it comes from."""
+
+    covariance: Covariance
+    cov: Array  # (p, p) what counts: corrected, and without the information that noise pretends
+    scales: Array  # (p,) what each parameter must be known to
+    pretended: float  # the greatest share of a direction's information that is noise's
+
+
+def joint_trust(fit: JointFit) -> Trust:
+    """Return the covariance of the calibration."""
+    scales = border_scales(fit)
+    covariance = joint_covariance(fit, scales)
+    values, vectors = np.linalg.eigh(fit.drawn.S * scales[:, None] * scales)
+    root = scales[:, None] * vectors / np.sqrt(np.maximum(values, values[-1] * 1e-15))  # F F^T = S^-1
+    share, directions = np.linalg.eigh(root.T @ noise_information(fit) @ root)
+    share = np.clip(share, 0.0, 1 - _KNOWN_AT_LEAST)
+    inverse = np.linalg.inv(root)
+    grown = root @ (directions / np.sqrt(1 - share)) @ directions.T @ inverse
+    return Trust(covariance, grown @ covariance.corrected @ grown.T, scales, float(share.max()))
+
+
+def joint_covariance(fit: JointFit, scales: Array) -> Covariance:
     """Return the covariance of the border, plain and corrected, by epochs of time."""
     S, scores, t = [], [], []
     for part in fit.problem.parts(fit.x):
@@ -22,7 +52,22 @@ def joint_covariance(fit: JointFit) -> Covariance:
             t.append(part.t_s)
     together = np.concatenate(S)
     prior = fit.drawn.S - together.sum(axis=0)
-    return covariance_in_time(together, np.concatenate(scores), np.concatenate(t), 1.0, border_scales(fit), prior)
+    return covariance_in_time(together, np.concatenate(scores), np.concatenate(t), 1.0, scales, prior)
+
+
+def noise_information(fit: JointFit, seed: int = 1) -> Array:
+    """Return the part of S (p, p) that the trajectory's own noise makes: what another draw of it, N(0, A^-1), adds.
+
+    At rest the trajectory still turns and shakes by its noise, and the Jacobians take that for motion.
+    """
+    core = fit.system.core
+    assert isinstance(core, Banded)
+    white: Array = np.random.default_rng(seed).standard_normal(core.ab.shape[1])
+    moved = core.draw(white).reshape(fit.system.gradient_core.shape)
+    x = fit.problem.retract(fit.x, moved, np.zeros(fit.problem.border.size))
+    _, system = fit.problem.linearize(x)
+    out: Array = schur(system)[1] - fit.drawn.S
+    return out
 
 
 def border_scales(fit: JointFit) -> Array:
@@ -30,8 +75,13 @@ def border_scales(fit: JointFit) -> Array:
     border = fit.problem.border
     scales = np.empty(border.size)
     scales[border["gravity"]] = _GRAVITY_SCALE
+    for name in set(fit.problem.extras) - {LINE}:
+        scales[border[name]] = SCALES[""]
     for c, (frames, camera) in enumerate(zip(fit.problem.cameras, fit.x.cameras, strict=True)):
-        scales[border[f"T {c}"]] = [SCALES["m"]] * 3 + [SCALES["rad"]] * 3
+        scales[border[f"T {c}"]] = TRANSFORM_SCALES
         scales[border[f"dt {c}"]] = SCALES["s"]
         scales[border[f"lens {c}"]] = lens_scales(frames.views, camera.lens)
+        if LINE in fit.problem.extras:
+            rows = frames.views.image_size[1]
+            scales[border[f"{LINE} {c}"]] = SCALES["s"] / (LINE_SCALE * rows)  # of the whole readout
     return scales

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.hand_eye import Settings, calibrate_hand_eye
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
@@ -181,7 +182,8 @@ def compared(what: str, ours: list[Array], other: dict[str, list[Array]]) -> boo
 def main() -> None:
     if not HAS:
         print(f"OpenCV {cv2.__version__} has no calibrateHandEye: calibkit alone; OpenCV 4 shows the ratios\n")
-    missed = [speed(), accuracy()]
+    with threadpool_limits(1, user_api="blas"):  # as the command line does
+        missed = [speed(), accuracy()]
     raise SystemExit(any(missed))
 
 

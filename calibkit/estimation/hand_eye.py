@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
@@ -90,7 +91,11 @@ def calibrate_hand_eye(data: HandEyeData, settings: Settings | None = None, corn
 
     With each pose's corners, a robot's X is that of the least reprojection error, the robot's own noise beside it.
     """
-    settings = settings or Settings()
+    with threadpool_limits(1, user_api="blas"):  # the matrices are small: threads cost more than they bring
+        return _calibrate(data, settings or Settings(), corners)
+
+
+def _calibrate(data: HandEyeData, settings: Settings, corners: Corners | None) -> HandEyeFit:
     if data.n_worlds == 0 or np.bincount(data.world, minlength=data.n_worlds).min() < _FEWEST:
         raise BadInputError(f"hand-eye needs two poses at least and has {len(data.P)}: record 10 or more, turned about two axes or more")
     data = _in_chunks(data, settings)

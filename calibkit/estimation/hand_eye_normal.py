@@ -110,7 +110,7 @@ def believed(data: HandEyeData, C: Array, C_P: Array, kept: Mask, system: Normal
     some = used[:: max(1, len(used) // ENOUGH_FOR_NOISE)]
     W = system.W[some]
     D = C_P[some] @ W @ (C[some] - C_P[some])
-    by_chance = np.einsum("klab,kai,lbj->ij", np.tensordot(D, W, axes=(0, 0)), _AD, _AD, optimize=True) * len(used) / max(len(some), 1)
+    by_chance = np.einsum("klab,kai,lbj->ij", np.einsum("nkl,nab->klab", D, W), _AD, _AD, optimize=True) * len(used) / max(len(some), 1)
     by_chance = (by_chance + by_chance.T) / 2
     units = SCALES[:, None] * SCALES
     if chance:

@@ -18,7 +18,7 @@ from calibkit.estimation.hand_eye_data import HandEyeData, Mask
 from calibkit.estimation.hand_eye_images import Corners, Sight
 from calibkit.estimation.hand_eye_lens import lens_step
 from calibkit.estimation.hand_eye_noise import RobotNoise
-from calibkit.estimation.hand_eye_normal import ENOUGH_FOR_NOISE, Normal, believed, normal
+from calibkit.estimation.hand_eye_normal import ENOUGH_FOR_NOISE, Normal, believed, inverse, normal
 from calibkit.estimation.hand_eye_robust import FEWEST_OTHERS, Seed
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -160,5 +160,5 @@ def _chi2(data: HandEyeData, C: Array, left: Array, kept: Mask, system: Normal) 
     in_world, in_X = kept | (count < 2), kept & (count >= 2)
     V = C + np.where(in_world, -1, 1)[:, None, None] * by_world + np.where(in_X, -1, 1)[:, None, None] * by_X
     # What the fit cannot miss has no residual but rounding.
-    out: Array = np.sum(left * np.linalg.solve(V + 1e-6 * C, left[:, :, None])[:, :, 0], axis=1)
+    out: Array = np.sum(left * (inverse(V + 1e-6 * C) @ left[:, :, None])[:, :, 0], axis=1)
     return out

@@ -46,7 +46,7 @@ def seed(data: HandEyeData, rng: np.random.Generator) -> Seed:
     kept, sigma_phi, sigma_rho = inliers(data, best)
     rank = 0
     for _ in range(_ROUNDS):
-        pairs = pairs_of(data, kept, rng)
+        pairs = _some_pairs(data, kept, rng)
         if len(pairs) == 0:
             break
         A, B = motions(data.P, pairs), motions(data.Q, pairs)
@@ -60,7 +60,7 @@ def seed(data: HandEyeData, rng: np.random.Generator) -> Seed:
     return Seed(best, worlds(data, best, kept), kept, rank, sigma_phi, sigma_rho)
 
 
-def pairs_of(data: HandEyeData, kept: Mask, rng: np.random.Generator) -> Index:
+def _some_pairs(data: HandEyeData, kept: Mask, rng: np.random.Generator) -> Index:
     """Return pairs (k, 2) of kept poses of one world: all of up to 60 poses."""
     if data.n_worlds == 1:
         at = np.flatnonzero(kept)
@@ -148,7 +148,7 @@ def _scores(X: Array, A: Array, B: Array) -> Array:
 def _median(values: Array, used: Mask) -> Array:
     """Return medians (w, c) of values (w, k, c) where used (w, k): at least one in each row."""
     if used.all():
-        return np.asarray(np.median(values, axis=1))
+        return np.asarray(values.mean(axis=1) if values.shape[1] == 2 else np.median(values, axis=1))
     ordered = np.sort(np.where(used[..., None], values, np.inf), axis=1)
     count = used.sum(axis=1)
     at = np.arange(len(values))

@@ -21,6 +21,7 @@ COMMANDS: tuple[str, ...] = (
     "imu",
     "timeoffset",
     "handeye",
+    "joint",
     "report",
     "import_",
     "export",

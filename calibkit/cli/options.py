@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from calibkit.models.imu import Gravity
     from calibkit.stages.outputs import Outputs
 
 Imu = Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")]
@@ -25,6 +26,9 @@ AccelUnit = Annotated[
     str | None,
     typer.Option("--accel-unit", help="Unit of an IMU's file that does not say it: m/s^2, g, counts, ... [default: m/s^2]"),
 ]
+LocalGravity = Annotated[float | None, typer.Option("--gravity", metavar="M/S2", help="|g| where it was recorded. [default: 9.80665]")]
+Latitude = Annotated[float | None, typer.Option("--latitude", metavar="DEG", help="Or where it was, for normal gravity.")]
+Altitude = Annotated[float | None, typer.Option("--altitude", metavar="M", help="With --latitude: above the sea.")]
 Resolution = Annotated[str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")]
 RosDistro = Annotated[str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs.")]
@@ -59,3 +63,23 @@ def size_of(text: str | None) -> tuple[int, int] | None:
     if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:7]) < 100000 for part in parts):
         raise BadInputError(f"--resolution {one_line(text)}: write WIDTHxHEIGHT in px, such as 752x480")
     return int(parts[0]), int(parts[1])
+
+
+def gravity_of(value: float | None, latitude: float | None, altitude: float | None) -> "Gravity":
+    """Return |g| as given, of a place on Earth, or the standard's."""
+    from calibkit.errors import BadInputError
+    from calibkit.models.imu import STANDARD_GRAVITY, Gravity, gravity_at
+
+    if value is not None:
+        if latitude is not None or altitude is not None:
+            raise BadInputError("--gravity and --latitude say the same: give one of them")
+        if not 0.1 <= value <= 100:
+            raise BadInputError(f"--gravity {value:g} is no gravity: on Earth it is 9.78 to 9.83 m/s^2")
+        return Gravity(value, 0.0, "given")
+    if latitude is None:
+        if altitude is not None:
+            raise BadInputError("--altitude needs --latitude")
+        return STANDARD_GRAVITY
+    if not (abs(latitude) <= 90 and abs(altitude or 0) <= 10000):
+        raise BadInputError("--latitude is from -90 to 90 deg, --altitude at most 10000 m")
+    return gravity_at(latitude, altitude)

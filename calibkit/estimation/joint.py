@@ -23,8 +23,9 @@ from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
 from calibkit.estimation.turns import in_order
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
+from calibkit.models.imu import STANDARD_GRAVITY
 
-STANDARD = GravityPrior(9.80665, 0.02)
+_STANDARD = GravityPrior(STANDARD_GRAVITY.value, STANDARD_GRAVITY.sigma)
 _LEAST_S = 1.0
 _MARGIN_S = 0.01  # frames so near an end of the IMU's samples are left out: td may move
 
@@ -54,7 +55,7 @@ class CameraInput:
 
 @dataclass(frozen=True)
 class Settings:
-    gravity: GravityPrior = STANDARD
+    gravity: GravityPrior = _STANDARD
     spacing: float | None = None  # s, of the knots; None: chosen by the IMU's samples
 
 
@@ -69,6 +70,13 @@ class Joint:
     frames: tuple[Array, ...]  # per camera: rows of its views that took part
     fineness: Fineness
     rate_hz: float
+    densities_told: tuple[bool, bool]  # white noise of gyroscope and accelerometer
+    walks_told: tuple[bool, bool]
+
+    @property
+    def frames_left_out(self) -> int:
+        """Return how many frames with a pose of the board lie outside of the IMU's samples."""
+        return sum(len(pose.frame) - len(rows) for pose, rows in zip(self.poses, self.frames, strict=True))
 
 
 def calibrate_joint(
@@ -87,7 +95,8 @@ def calibrate_joint(
     t = (imu.t_ns - origin) * 1e-9
     times = [(each.views.t_ns - origin) * 1e-9 for each in cameras]
     seen = [at[each.frame] + turn.td for at, each, turn in zip(times, poses, turns, strict=True)]
-    low, high = max(t[0], min(each.min() for each in seen)), min(t[-1], max(each.max() for each in seen))
+    low = max(t[0], min(each.min() for each in seen) - 2 * _MARGIN_S)
+    high = min(t[-1], max(each.max() for each in seen) + 2 * _MARGIN_S)
     if high - low < _LEAST_S:
         raise BadInputError("cameras and IMU share too little time: record both at once, 10 s or more")
     inside = (t >= low) & (t <= high)
@@ -114,7 +123,9 @@ def calibrate_joint(
         knots, cameras[0].views.board.points, rows, tuple(grids), settings.gravity, lens_priors=tuple(each.lens_prior for each in cameras)
     )
     fit = fit_joint(problem, start)
-    return Joint(fit, origin, tuple(poses), tuple(turns), tuple(used), fine, rate_hz)
+    told = (noise.gyro_noise_density is not None, noise.accel_noise_density is not None)
+    walks = (noise.gyro_random_walk is not None, noise.accel_random_walk is not None)
+    return Joint(fit, origin, tuple(poses), tuple(turns), tuple(used), fine, rate_hz, told, walks)
 
 
 def _grid(each: CameraInput, frames: Array) -> CameraViews:

@@ -67,6 +67,7 @@ class JointProblem:
     loss_scale: float = np.inf  # Cauchy's, in sigmas
     lens_priors: tuple[tuple[Array, Array] | None, ...] = ()  # lens and information (l, l) of each camera, where it is known
     extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
+    held: bool = False  # the calibration, and the trajectory alone is free
 
     @property
     def border(self) -> Border:
@@ -77,6 +78,9 @@ class JointProblem:
 
     def linearize(self, x: JointState) -> tuple[float, Arrowhead]:
         cost, system = assemble(self.parts(x), self.knots.controls, self.knots.order, self.border.size)
+        if self.held:
+            p = self.border.size
+            return cost, Arrowhead(system.core, np.zeros_like(system.border), np.eye(p), system.gradient_core, np.zeros(p))
         prior_cost, C, g = self.prior(x)
         return cost + prior_cost, Arrowhead(system.core, system.border, system.corner + C, system.gradient_core, system.gradient_border + g)
 

@@ -62,7 +62,7 @@ def noise_information(fit: JointFit, seed: int = 1) -> Array:
     """
     core = fit.system.core
     assert isinstance(core, Banded)
-    white: Array = np.random.default_rng(seed).standard_normal(core.ab.shape[1])
+    white = np.random.default_rng(seed).standard_normal((core.ab.shape[1],))
     moved = core.draw(white).reshape(fit.system.gradient_core.shape)
     x = fit.problem.retract(fit.x, moved, np.zeros(fit.problem.border.size))
     _, system = fit.problem.linearize(x)

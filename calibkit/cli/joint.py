@@ -1,0 +1,74 @@
+"""`calibkit joint`: cameras and an IMU on one trajectory."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibkit.cli import options
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("joint")(run)
+
+
+def run(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="SOURCE...", help="Bags, folders or CSV files with images or corners of a board, and an IMU.")
+    ],
+    target: Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target file, or calibkit target's.")],
+    camera: Annotated[
+        list[str] | None,
+        typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
+    ] = None,
+    imu: Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic.")] = None,
+    out: options.Out = None,
+    rig: options.Rigs = None,
+    report: options.Report = None,
+    json_file: options.Json = None,
+    hold_lens: Annotated[
+        bool,
+        typer.Option("--hold-lens", help="Keep the lens near the rig file's, by its covariance: where that is from another recording."),
+    ] = False,
+    knots: Annotated[
+        float | None, typer.Option("--knots", metavar="MS", help="Between the trajectory's knots. [default: as the IMU's samples ask for]")
+    ] = None,
+    gravity: options.LocalGravity = None,
+    latitude: options.Latitude = None,
+    altitude: options.Altitude = None,
+    no_halves: Annotated[bool, typer.Option("--no-halves", help="Do not calibrate each half by itself as a check.")] = False,
+    rate: options.Rate = None,
+    gyro_unit: options.GyroUnit = None,
+    accel_unit: options.AccelUnit = None,
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Look for corners again, even where they were found before.")] = False,
+    ros_distro: options.RosDistro = None,
+    force: options.Force = False,
+    strict: options.Strict = False,
+) -> None:
+    """Calibrate cameras and an IMU together: T_cam_imu, the offset of their clocks, the lens, gravity and biases, on one trajectory.
+
+    Starts from a rig file with the lenses (calibkit intrinsics) and, where there is one, the IMU's noise (calibkit allan); everything else
+    is found by itself. Move and turn the rig before the board for 30 s or more, about all axes. What the motion does not tell is named, and
+    not given as a number. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording.
+    """
+    from calibkit.cli.progress import bar
+    from calibkit.cli.shown import show
+    from calibkit.errors import BadInputError
+    from calibkit.io.imu_options import ImuOptions
+    from calibkit.stages.joint import Options, joint
+
+    if knots is not None and not 2 <= knots <= 500:
+        raise BadInputError(f"--knots {knots:g}: give 2 to 500 ms")
+    asked = Options(
+        cameras=tuple(camera or ()),
+        imu=imu,
+        reading=ImuOptions(rate, gyro_unit, accel_unit),
+        gravity=options.gravity_of(gravity, latitude, altitude),
+        knots_s=None if knots is None else knots * 1e-3,
+        hold_lens=hold_lens,
+        halves=not no_halves,
+        cache=not no_cache,
+        ros_distro=ros_distro,
+    )
+    show(joint(sources, target, options.outputs_of([*sources, target], out, report, json_file, rig, force), asked, bar), strict)

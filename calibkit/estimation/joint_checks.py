@@ -1,0 +1,123 @@
+"""Whether the joint estimate repeats: each half by itself, and one half's calibration on the other; and what else the data ask for."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibkit.estimation.joint_fit import JointFit, corner_residuals
+from calibkit.estimation.joint_noise import DRAWS, draw, schur
+from calibkit.estimation.joint_problem import Frames, JointProblem
+from calibkit.estimation.joint_state import SCALE, JointState
+from calibkit.estimation.joint_trust import border_scales, joint_covariance
+from calibkit.estimation.lens_fit import rows_of
+from calibkit.geometry import se3
+from calibkit.geometry.so3 import Array
+from calibkit.geometry.spline import Knots
+from calibkit.solver.levenberg_marquardt import minimise
+
+_SHORTEST_S = 8.0  # a recording whose halves are shorter than half of that is not halved
+_HALF_STEPS = 6
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Calibration by the first and by the second half."""
+
+    z: Array  # (p,) their difference over its sigma, gravity left out (0)
+    rms_px: tuple[float, ...]  # per camera: corners of the second half under the first half's calibration, its trajectory free
+    own_rms_px: tuple[float, ...]  # and under its own
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What was asked of the estimate."""
+
+    board_scale: tuple[float, float]  # by the accelerations, with sigma
+    halves: Halves | None
+
+
+def check_joint(fit: JointFit, halves: bool = True) -> Checks:
+    """Return the checks."""
+    return Checks(board_scale(fit), _halves(fit) if halves else None)
+
+
+def board_scale(fit: JointFit) -> tuple[float, float]:
+    """Return the board's size over what its file says, one Gauss-Newton step with that in the border, and its sigma."""
+    if SCALE in fit.problem.extras:
+        return fit.x.board_scale, 0.0
+    asked = replace(fit, problem=replace(fit.problem, extras=(*fit.problem.extras, SCALE)))
+    _, system = asked.problem.linearize(fit.x)
+    asked = replace(asked, system=system, drawn=draw(system, DRAWS))
+    answer, S = schur(system)
+    g = system.gradient_border - answer.T @ system.gradient_core.ravel()
+    scales = border_scales(asked)
+    step = np.linalg.lstsq(S * scales[:, None] * scales, scales * g, rcond=1e-14)[0] * scales
+    k = asked.problem.border[SCALE].start
+    return 1 + float(step[k]), float(np.sqrt(joint_covariance(asked, scales).corrected[k, k]))
+
+
+def _halves(fit: JointFit) -> Halves | None:
+    knots = fit.problem.knots
+    if knots.segments * knots.spacing < _SHORTEST_S:
+        return None
+    middle = knots.segments // 2
+    whole = (slice(0, middle), slice(middle, knots.segments))
+    halves = [_refit(*part_of(fit.problem, fit.x, segments)) for segments in whole]
+    if any(not half.converged for half in halves):
+        return None
+    scales = border_scales(fit)
+    covs = [joint_covariance(half, scales).corrected for half in halves]
+    off = _difference(halves[0], halves[1])
+    z = off / np.sqrt(np.diag(covs[0]) + np.diag(covs[1]))
+    z[fit.problem.border["gravity"]] = 0
+    first, second = halves
+    held = replace(second.problem, held=True)
+    other = minimise(held, _with_calibration(second.x, first.x), max_steps=_HALF_STEPS, tolerance=1e-5).x
+    count = range(len(fit.problem.cameras))
+    rms, own = (tuple(_rms(second.problem, x, c) for c in count) for x in (other, second.x))
+    return Halves(z, rms, own)
+
+
+def _with_calibration(x: JointState, of: JointState) -> JointState:
+    return replace(x, cameras=of.cameras, gravity=of.gravity, board_scale=of.board_scale, imu=of.imu)
+
+
+def _difference(a: JointFit, b: JointFit) -> Array:
+    """Return the step of the border from a to b."""
+    border = a.problem.border
+    out = np.zeros(border.size)
+    for c, (one, two) in enumerate(zip(a.x.cameras, b.x.cameras, strict=True)):
+        out[border[f"T {c}"]] = se3.local(one.T_cam_imu, two.T_cam_imu)
+        out[border[f"dt {c}"]] = two.dt - one.dt
+        out[border[f"lens {c}"]] = two.lens - one.lens
+    return out
+
+
+def _rms(problem: JointProblem, x: JointState, c: int) -> float:
+    px, valid = corner_residuals(problem, x, c)
+    kept = (problem.cameras[c].views.weight > 0) & valid
+    return float(np.sqrt(np.sum(px[kept] ** 2) / max(int(kept.sum()), 1)))
+
+
+def _refit(problem: JointProblem, x: JointState) -> JointFit:
+    solution = minimise(problem, x, max_steps=_HALF_STEPS * 3, tolerance=1e-6)
+    _, system = problem.linearize(solution.x)
+    found = tuple(frames.views.weight > 0 for frames in problem.cameras)
+    return JointFit(problem, solution.x, system, draw(system, DRAWS), found, {}, {}, solution.converged, solution.steps)
+
+
+def part_of(problem: JointProblem, x: JointState, segments: slice) -> tuple[JointProblem, JointState]:
+    """Return the problem and the state of some of the segments: samples and frames whose time lies in them."""
+    whole = problem.knots
+    knots = Knots(whole.start + segments.start * whole.spacing, whole.spacing, whole.order, segments.stop - segments.start)
+    end = knots.start + knots.segments * knots.spacing
+    imu = problem.imu
+    rows = (imu.t >= knots.start) & (imu.t < end)
+    cameras = []
+    for frames, camera in zip(problem.cameras, x.cameras, strict=True):
+        inside = (frames.t + camera.dt >= knots.start) & (frames.t + camera.dt < end)
+        cameras.append(Frames(frames.t[inside], rows_of(frames.views, inside)))
+    imu = replace(imu, t=imu.t[rows], gyro=imu.gyro[rows], accel=imu.accel[rows], keep=imu.keep[rows])
+    controls = slice(segments.start, segments.stop + whole.order - 1)
+    state = replace(x, R=x.R[controls], p=x.p[controls], bias=x.bias[controls])
+    return replace(problem, knots=knots, imu=imu, cameras=tuple(cameras)), state

@@ -1,0 +1,224 @@
+"""From a joint estimate to a result: the rig's entries, what is said of them, and what the report draws."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calibkit.data.result import ResidualSet, Result
+from calibkit.data.rig import Camera, Estimate, Reprojection, Rig
+from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
+from calibkit.data.verdict import Status
+from calibkit.estimation.hand_eye_known import parameter_statuses
+from calibkit.estimation.joint import CameraInput, Joint
+from calibkit.estimation.joint_checks import Checks
+from calibkit.estimation.joint_fit import corner_residuals, poses_of_board
+from calibkit.estimation.joint_trust import Trust
+from calibkit.estimation.joint_verdict import Judged, judge_joint, known
+from calibkit.estimation.stamps import StampReport
+from calibkit.estimation.time_offset_result import early_or_late
+from calibkit.geometry import se3, so3
+from calibkit.geometry.so3 import Array
+from calibkit.geometry.spline import Steps, basis, turning
+
+STAGE = "joint"
+
+
+def joint_result(
+    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imu: str, stamps: dict[str, StampReport]
+) -> Result:
+    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera."""
+    names = tuple(each.views.camera for each in cameras)
+    judged = judge_joint(joint, trust, checks, names, imu, stamps)
+    fit, border = joint.fit, joint.fit.problem.border
+    rig = Rig()
+    unknown: list[str] = []
+    for c, (name, each) in enumerate(zip(names, cameras, strict=True)):
+        T, dt = f"T_{name}_{imu}", f"dt_{imu}_{name}"
+        where = border[f"T {c}"]
+        cov = trust.cov[where, where]
+        x = fit.x.cameras[c]
+        statuses = parameter_statuses(x.T_cam_imu, cov)
+        entry = make_transform(
+            name,
+            imu,
+            x.T_cam_imu,
+            cov,
+            known(judged.statuses, where),
+            statuses=statuses,
+            verdict=judged.verdict(T),
+            reasons=judged.texts(T),
+        )
+        rig.transforms[T] = entry
+        k = border[f"dt {c}"]
+        status = judged.statuses[k.start]
+        offset = _estimate(x.dt, "s", trust, k.start, status)
+        rig.time_offsets[dt] = make_time_offset(imu, name, offset, verdict=judged.verdict(dt), reasons=judged.texts(dt))
+        rig.cameras[name] = _camera(joint, trust, judged, each, c)
+        unknown += [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
+        unknown += [f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else []
+        unknown += [f"{name}.{key}" for key, value in rig.cameras[name].parameters.items() if value.status is Status.NOT_OBSERVABLE]
+    residuals = [_corner_set(joint, cameras[c], c) for c in range(len(names))]
+    return Result(
+        stage=STAGE,
+        rig=rig,
+        reasons=judged.all,
+        residuals=tuple(residuals + _imu_sets(joint, imu)),
+        facts={
+            "joint": _facts(joint, trust, checks, names, imu),
+            "frame_labels": {
+                name: [each.views.labels[i] for i in rows] for name, each, rows in zip(names, cameras, joint.frames, strict=True)
+            },
+            "lines": _lines(joint, trust, checks, names, imu, judged),
+        },
+        not_observable=tuple(unknown),
+    )
+
+
+def _estimate(value: float, unit: str, trust: Trust, k: int, status: Status) -> Estimate:
+    if status is Status.NOT_OBSERVABLE:
+        return Estimate(value=None, unit=unit, status=status)
+    sigma, plain = (float(np.sqrt(cov[k, k])) for cov in (trust.cov, trust.covariance.plain))
+    return Estimate(value=float(value), unit=unit, sigma=sigma, sigma_plain=plain, status=status)
+
+
+def _camera(joint: Joint, trust: Trust, judged: Judged, each: CameraInput, c: int) -> Camera:
+    fit, name = joint.fit, each.views.camera
+    where = fit.problem.border[f"lens {c}"]
+    model = fit.problem.cameras[c].views.model
+    parameters = {
+        p: _estimate(fit.x.cameras[c].lens[i], "px" if i < 4 else "", trust, where.start + i, judged.statuses[where.start + i])
+        for i, p in enumerate(model.parameter_names)
+    }
+    every = all(value.value is not None for value in parameters.values())
+    px, valid = corner_residuals(fit.problem, fit.x, c)
+    kept, found = fit.problem.cameras[c].views.weight > 0, fit.found[c] & valid
+    return each.camera.model_copy(
+        update={
+            "parameters": parameters,
+            "covariance": make_covariance(model.parameter_names, trust.cov[where, where]) if every else None,
+            "reprojection": Reprojection(
+                rms_px=_rms(px[kept]),
+                rms_all_px=_rms(px[found]),
+                held_out_rms_px=None,
+                corners=int(kept.sum()),
+                corners_dropped=int(fit.found[c].sum() - kept.sum()),
+                frames=len(joint.frames[c]),
+                frames_dropped=each.views.n_frames - len(joint.frames[c]),
+            ),
+            "verdict": judged.verdict(name),
+            "reasons": judged.texts(name),
+        }
+    )
+
+
+def _rms(px: Array) -> float:
+    return float(np.sqrt(np.sum(px**2) / max(len(px), 1)))
+
+
+def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
+    """Return every corner's residual with the rate of turn and where the board was."""
+    fit, frames, camera = joint.fit, joint.fit.problem.cameras[c], joint.fit.x.cameras[c]
+    px, valid = corner_residuals(fit.problem, fit.x, c)
+    frame, corner = np.nonzero(fit.found[c])
+    T = poses_of_board(fit.problem, fit.x, c)
+    i, u = fit.problem.knots.locate(frames.t + camera.dt)
+    at = turning(fit.x.R, Steps.of(fit.x.R), i, basis(fit.problem.knots, u), basis(fit.problem.knots, u, 1), jacobians=False)
+    points = se3.transform(T, fit.problem.points)
+    weight = frames.views.weight[frame, corner]
+    usual = float(np.median(weight[weight > 0])) if np.any(weight > 0) else 1.0
+    return ResidualSet(
+        sensor=each.views.camera,
+        unit="px",
+        t_ns=each.views.t_ns[joint.frames[c]][frame],
+        raw=np.where(valid[..., None], px, np.nan)[frame, corner],
+        sigma=1 / np.where(weight > 0, weight, usual),
+        context={
+            "uv": frames.views.uv[frame, corner],
+            "corner": corner.astype(np.int32),
+            "frame": frame.astype(np.int32),
+            "kept": weight > 0,
+            "distance": np.linalg.norm(points, axis=-1)[frame, corner],
+            "tilt": np.arccos(np.clip(np.abs(T[:, 2, 2]), 0, 1))[frame],
+            "rate": np.linalg.norm(at.omega, axis=1)[frame],
+        },
+    )
+
+
+def _imu_sets(joint: Joint, imu: str) -> list[ResidualSet]:
+    """Return the gyroscope's and the accelerometer's residuals, with what was measured and the biases."""
+    fit, rows = joint.fit, joint.fit.problem.imu
+    left = fit.problem.imu_residuals(fit.x)
+    i, _ = fit.problem.knots.locate(rows.t)
+    t_ns = joint.origin_ns + np.round(rows.t * 1e9).astype(np.int64)
+    sets = []
+    for k, (name, unit, measured) in enumerate((("gyro", "rad/s", rows.gyro), ("accel", "m/s^2", rows.accel))):
+        part = slice(3 * k, 3 * k + 3)
+        context = {"measured": measured, "bias": fit.x.bias[i, part], "kept": rows.keep[:, k]}
+        sets.append(ResidualSet(f"{imu}_{name}", unit, t_ns, left[:, part], np.full(len(rows.t), float(rows.sigma[part].mean())), context))
+    return sets
+
+
+def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str) -> dict[str, object]:
+    """Return everything in SI units, for machines."""
+    fit, x = joint.fit, joint.fit.x
+    halves = checks.halves
+    return {
+        "imu": imu,
+        "cameras": list(names),
+        "gravity": x.gravity.tolist(),
+        "gravity_sigma": np.sqrt(np.diag(trust.cov)[:3]).tolist(),
+        "bias_mean": x.bias.mean(axis=0).tolist(),
+        "noise": {
+            kind: {"factor": fit.factors.get(kind, 1.0), "residuals": part.rows}
+            for kind, part in fit.components.items()
+            if kind in fit.factors
+        },
+        "sample_sigma": fit.problem.imu.sigma.tolist(),
+        "knots": {"order": fit.problem.knots.order, "spacing": fit.problem.knots.spacing, "unknowns": 12 * fit.problem.knots.controls},
+        "board_scale": list(checks.board_scale),
+        "halves": None
+        if halves is None
+        else {"z": halves.z.tolist(), "rms_px": list(halves.rms_px), "own_rms_px": list(halves.own_rms_px)},
+        "pretended": trust.pretended,
+        "blocks": trust.covariance.blocks,
+        "steps": fit.steps,
+    }
+
+
+def _lines(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str, judged: Judged) -> list[str]:
+    fit, x, border, rows = joint.fit, joint.fit.x, joint.fit.problem.border, joint.fit.problem.imu
+    knots = fit.problem.knots
+    corners = sum(int((frames.views.weight > 0).sum()) for frames in fit.problem.cameras)
+    root = np.sqrt(joint.rate_hz)
+    lines = [
+        f"{', '.join(names)} and {imu}: {corners} corners in {sum(len(each) for each in joint.frames)} frames, {len(rows.t)} samples over "
+        f"{knots.segments * knots.spacing:.4g} s; spline of order {knots.order}, a knot every {knots.spacing * 1e3:.3g} ms",
+        f"  noise as the residuals have it: gyroscope {rows.sigma[:3].mean() / root:.2e} rad/s/sqrt(Hz), accelerometer "
+        f"{rows.sigma[3:].mean() / root:.2e} m/s^2/sqrt(Hz)"
+        + "".join(f", corners of {name} {_corner_sigma(joint, c):.3g} px" for c, name in enumerate(names)),
+    ]
+    for c, name in enumerate(names):
+        T, k = x.cameras[c].T_cam_imu, border[f"dt {c}"].start
+        if judged.statuses[k] is not Status.NOT_OBSERVABLE:
+            sigma = 1e3 * float(np.sqrt(trust.cov[k, k]))
+            lines.append(f"  t_{imu} = t_{name} + dt: {early_or_late(name, x.cameras[c].dt)} (+- {sigma:.2g} ms)")
+        if not any(each.grade == "not observable" for each in judged.opens[c]):
+            v, p = np.degrees(so3.log(T[:3, :3])), 1e3 * se3.inverse(T)[:3, 3]
+            turned = f"R_{name}_{imu} = exp({v[0]:.4f}, {v[1]:.4f}, {v[2]:.4f}) deg"
+            lines.append(f"  {turned}; {name} sits at ({p[0]:.2f}, {p[1]:.2f}, {p[2]:.2f}) mm of {imu}")
+    size, where = float(np.linalg.norm(x.gravity)), border["gravity"]
+    along = x.gravity / size
+    lines.append(f"  gravity {size:.4f} +- {float(np.sqrt(along @ trust.cov[where, where] @ along)):.2g} m/s^2")
+    if checks.halves is not None:
+        worst = np.abs(checks.halves.z).max()
+        px = ", ".join(
+            f"{name} {a:.3g} px ({b:.3g} under its own)"
+            for name, a, b in zip(names, checks.halves.rms_px, checks.halves.own_rms_px, strict=True)
+        )
+        lines.append(f"  halves agree within {worst:.1f} sigma; the second half under the first one's calibration: {px}")
+    return lines
+
+
+def _corner_sigma(joint: Joint, c: int) -> float:
+    weight = joint.fit.problem.cameras[c].views.weight
+    return float(1 / np.median(weight[weight > 0])) if np.any(weight > 0) else float("nan")

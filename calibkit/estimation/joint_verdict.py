@@ -1,0 +1,159 @@
+"""What the joint estimate is worth: what the motion left open and would mend, and what speaks against the data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.data.plural import counted
+from calibkit.data.verdict import Reason, Status, Verdict, worst
+from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint_checks import Checks
+from calibkit.estimation.joint_trust import Trust
+from calibkit.estimation.open_directions import Open, open_directions
+from calibkit.estimation.stamps import StampReport
+from calibkit.estimation.time_offset_verdict import judge_time_offset
+from calibkit.geometry.so3 import Array
+from calibkit.solver.trust import grade
+
+_VERDICTS = {Status.DETERMINED: Verdict.PASS, Status.WEAK: Verdict.CHECK, Status.NOT_OBSERVABLE: Verdict.FAIL}
+_NOISIER = {"camera": (2.0, 6.0), "gyro": (3.0, 30.0), "accel": (3.0, 30.0)}  # real over stated sigma: CHECK, FAIL
+_LOST, _MOSTLY_LOST = 0.05, 0.3
+_GRAVITY_OFF = 4.0  # sigmas of what was told
+_SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
+_HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
+_MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
+_WORDS = {"gyro": "gyroscope", "accel": "accelerometer"}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Status of each border parameter, and all there is to say."""
+
+    statuses: tuple[Status, ...]  # (p,)
+    opens: tuple[tuple[Open, ...], ...]  # per camera, of T_cam_imu
+    reasons: dict[str, tuple[Reason, ...]]  # by rig entry, "" what concerns all
+
+    @property
+    def all(self) -> tuple[Reason, ...]:
+        return tuple(reason for each in self.reasons.values() for reason in each)
+
+    def verdict(self, entry: str) -> Verdict:
+        return worst(self.reasons.get(entry, ()))
+
+    def texts(self, entry: str) -> list[str]:
+        return [reason.text.removeprefix(f"{entry}: ") for reason in self.reasons.get(entry, ())]
+
+
+def judge_joint(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str, stamps: dict[str, StampReport]) -> Judged:
+    """Return what is known of cameras `names` and of `imu`."""
+    fit = joint.fit
+    border = fit.problem.border
+    sigma = np.sqrt(np.diag(trust.cov)) / trust.scales
+    statuses = [Status(grade(s)) for s in sigma]
+    reasons: dict[str, tuple[Reason, ...]] = {"": _of_all(joint, trust, checks, imu)}
+    opens = []
+    for c, name in enumerate(names):
+        T, dt = f"T_{name}_{imu}", f"dt_{imu}_{name}"
+        where = border[f"T {c}"]
+        found = open_directions(T, imu, np.eye(3), trust.cov[where, where])
+        opens.append(found)
+        reasons[T] = tuple(Reason(_VERDICTS[Status(each.grade)], f"{T}: {_open_text(each)}") for each in found)
+        k = border[f"dt {c}"].start
+        size = f"its sigma would be {sigma[k] * trust.scales[k] * 1e3:.2g} ms"
+        known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
+        reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
+        judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
+        reasons[dt] += tuple(reason for reason in judged.others if statuses[k] is not Status.NOT_OBSERVABLE)
+        reasons[name] = _of_camera(joint, trust, names, c)
+    return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
+
+
+def _open_text(each: Open) -> str:
+    cause = "not observable in this motion" if each.grade == "not observable" else f"weak ({each.sigma:.0f} times 1 mm, 1 mrad)"
+    mend = "accelerate along several axes" if each.text.startswith("R") else "turn about axes across it, 30 deg or more each way"
+    return f"{each.text} is {cause}: {mend}"
+
+
+def _of_camera(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:
+    fit, name = joint.fit, names[c]
+    where = fit.problem.border[f"lens {c}"]
+    model = fit.problem.cameras[c].views.model
+    sigma = (np.sqrt(np.diag(trust.cov)) / trust.scales)[where]
+    found = []
+    for status in (Status.NOT_OBSERVABLE, Status.WEAK):
+        those = [p for p, s in zip(model.parameter_names, sigma, strict=True) if Status(grade(s)) is status]
+        if those:
+            mend = "tilt the board by 30 to 45 deg, and bring it to the image's edges"
+            found.append(
+                Reason(_VERDICTS[status], f"{name}: {', '.join(those)} {'is' if len(those) == 1 else 'are'} {status.value}: {mend}")
+            )
+    weight, kept = fit.found[c], fit.problem.cameras[c].views.weight > 0
+    lost = 1 - kept.sum() / max(weight.sum(), 1)
+    if lost > _LOST:
+        verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
+        text = f"{100 * lost:.0f} % of the corners fit no trajectory that the IMU allows: wrong stamps, a wrong board file, or blur"
+        found.append(Reason(verdict, f"{name}: {text}"))
+    factor, limits = fit.factors[f"camera {c}"], _NOISIER["camera"]
+    if factor > limits[0]:
+        text = f"its corners are {factor:.1f} times noisier than the detector says"
+        cause = "stamps that jitter, a rolling shutter, a wrong board or lens model"
+        found.append(Reason(Verdict.FAIL if factor > limits[1] else Verdict.CHECK, f"{name}: {text}: {cause}"))
+    return tuple(found)
+
+
+def _of_all(joint: Joint, trust: Trust, checks: Checks, imu: str) -> tuple[Reason, ...]:
+    fit = joint.fit
+    found = []
+    if not fit.converged:
+        found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
+    for i, kind in enumerate(("gyro", "accel")):
+        factor, (check, fail) = fit.factors[kind], _NOISIER[kind]
+        if joint.densities_told[i] and factor > check:
+            text = f"{imu}'s {_WORDS[kind]} is {factor:.1f} times noisier than its noise density says: vibration, a wrong unit or density?"
+            found.append(Reason(Verdict.FAIL if factor > fail else Verdict.CHECK, text))
+        lost = 1 - float(np.mean(fit.problem.imu.keep[:, i]))
+        if lost > _LOST:
+            verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
+            found.append(
+                Reason(
+                    verdict, f"{100 * lost:.0f} % of the samples of {imu}'s {_WORDS[kind]} fit no smooth motion: shocks, or wrong samples"
+                )
+            )
+    prior = fit.problem.gravity
+    off = float(np.linalg.norm(fit.x.gravity)) - prior.size
+    if abs(off) > _GRAVITY_OFF * prior.sigma:
+        text = (
+            f"gravity comes out as {off + prior.size:.3f} m/s^2: {imu}'s accelerometer has a wrong scale or unit, or the board another size"
+        )
+        found.append(Reason(Verdict.FAIL, text))
+    scale, sigma = checks.board_scale
+    if abs(scale - 1) > max(_SCALE_OFF, _SURE * sigma):
+        text = f"the board seems {scale:.4f} +- {sigma:.2g} times the size that its file says, by {imu}'s accelerations"
+        found.append(Reason(Verdict.FAIL, f"{text}: measure it, or check {imu}'s scale"))
+    if not np.all(joint.walks_told):
+        text = f"{imu} has no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
+        found.append(Reason(Verdict.CHECK, text))
+    if checks.halves is not None and (apart := float(np.max(np.abs(checks.halves.z)))) > _HALVES_APART:
+        text = f"the two halves of the recording disagree by {apart:.1f} sigma"
+        found.append(Reason(Verdict.CHECK, f"{text}: something moved or drifts, or errors that their sigmas do not hold"))
+    n = joint.frames_left_out
+    if n:
+        found.append(
+            Reason(
+                Verdict.CHECK,
+                f"{counted(n, 'frame')} with a board {'lies' if n == 1 else 'lie'} outside of what {imu} recorded, or at its ends",
+            )
+        )
+    return tuple(found)
+
+
+def known(statuses: tuple[Status, ...], where: slice) -> Status:
+    """Return the worst of some parameters' statuses."""
+    order = (Status.DETERMINED, Status.WEAK, Status.NOT_OBSERVABLE)
+    return max(statuses[where], key=order.index)
+
+
+def parameter_sigma(cov: Array, where: slice) -> Array:
+    """Return sigma of each of some parameters."""
+    sigma: Array = np.sqrt(np.diag(cov)[where])
+    return sigma

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Camera, Estimate, Reprojection, Rig
@@ -12,6 +13,8 @@ from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_fit import corner_residuals, poses_of_board
+from calibkit.estimation.joint_noise import draw
+from calibkit.estimation.joint_state import BIASES, KNOT
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.joint_verdict import Judged, judge_joint, known
 from calibkit.estimation.stamps import StampReport
@@ -21,6 +24,7 @@ from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Steps, basis, turning
 
 STAGE = "joint"
+_BIAS_DRAWS = 32  # of the state: a sigma is then known to 13 %
 
 
 def joint_result(
@@ -57,18 +61,19 @@ def joint_result(
         unknown += [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
         unknown += [f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else []
         unknown += [f"{name}.{key}" for key, value in rig.cameras[name].parameters.items() if value.status is Status.NOT_OBSERVABLE]
-    residuals = [_corner_set(joint, cameras[c], c) for c in range(len(names))]
+    residuals = [*(_corner_set(joint, cameras[c], c) for c in range(len(names))), *_imu_sets(joint, imu)]
     return Result(
         stage=STAGE,
         rig=rig,
         reasons=judged.all,
-        residuals=tuple(residuals + _imu_sets(joint, imu)),
+        residuals=tuple(residuals),
         facts={
             "joint": _facts(joint, trust, checks, names, imu),
             "frame_labels": {
                 name: [each.views.labels[i] for i in rows] for name, each, rows in zip(names, cameras, joint.frames, strict=True)
             },
             "lines": _lines(joint, trust, checks, names, imu, judged),
+            "t_zero_ns": dict.fromkeys((each.sensor for each in residuals), joint.origin_ns),
         },
         not_observable=tuple(unknown),
     )
@@ -145,17 +150,35 @@ def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
 
 
 def _imu_sets(joint: Joint, imu: str) -> list[ResidualSet]:
-    """Return the gyroscope's and the accelerometer's residuals, with what was measured and the biases."""
+    """Return the gyroscope's and the accelerometer's residuals with what was measured, and the way with the biases on it."""
     fit, rows = joint.fit, joint.fit.problem.imu
     left = fit.problem.imu_residuals(fit.x)
     i, _ = fit.problem.knots.locate(rows.t)
-    t_ns = joint.origin_ns + np.round(rows.t * 1e9).astype(np.int64)
+    rate = np.linalg.norm(rows.gyro - left[:, :3] - fit.x.bias[i, :3], axis=1)
     sets = []
     for k, (name, unit, measured) in enumerate((("gyro", "rad/s", rows.gyro), ("accel", "m/s^2", rows.accel))):
         part = slice(3 * k, 3 * k + 3)
-        context = {"measured": measured, "bias": fit.x.bias[i, part], "kept": rows.keep[:, k]}
-        sets.append(ResidualSet(f"{imu}_{name}", unit, t_ns, left[:, part], np.full(len(rows.t), float(rows.sigma[part].mean())), context))
-    return sets
+        sigma = np.full(len(rows.t), float(rows.sigma[part].mean()))
+        context = {"measured": measured, "kept": rows.keep[:, k], "rate": rate}
+        sets.append(ResidualSet(f"{imu}_{name}", unit, _stamps(joint, rows.t), left[:, part], sigma, context))
+    return [*sets, _way(joint, imu)]
+
+
+def _way(joint: Joint, imu: str) -> ResidualSet:
+    """Return where the IMU was and its biases, once a segment; the residuals are the steps of the biases over their walk's sigma."""
+    fit, knots = joint.fit, joint.fit.problem.knots
+    i = np.arange(knots.segments)
+    value = basis(knots, np.full(knots.segments, 0.5))
+    place = np.einsum("nl,nlk->nk", value, fit.x.p[i[:, None] + np.arange(knots.order)])
+    steps = (fit.x.bias[i + 1] - fit.x.bias[i]) / (fit.problem.imu.walk * np.sqrt(knots.spacing))
+    drawn = draw(fit.system, _BIAS_DRAWS).core.reshape(knots.controls, KNOT, _BIAS_DRAWS)
+    sigma = np.sqrt(np.mean(drawn[i, BIASES] ** 2, axis=2))
+    context = {"place": place, "bias": fit.x.bias[i], "bias_sigma": sigma}
+    return ResidualSet(imu, "sigma", _stamps(joint, knots.middle(i)), steps, np.ones(knots.segments), context)
+
+
+def _stamps(joint: Joint, t: Array) -> NDArray[np.int64]:
+    return np.asarray(joint.origin_ns + np.round(t * 1e9).astype(np.int64))
 
 
 def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str) -> dict[str, object]:

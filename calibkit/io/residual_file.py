@@ -47,6 +47,8 @@ COLUMNS: dict[str, tuple[Dtype, tuple[int, ...]]] = {
     **dict.fromkeys(("before", "turn", "place", "motion"), ("float64", (3,))),
     "rotation": ("float64", (4,)),
     "px": ("float64", ()),
+    "measured": ("float64", (3,)),
+    **dict.fromkeys(("bias", "bias_sigma"), ("float64", (6,))),
 }
 
 ArrayName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]

@@ -20,6 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from calibkit.report.field import cells, grid, over_image, over_radius
 from calibkit.report.hand_eye_figures import cross_sections, pose_residuals, poses_in_space, rotation_axes
 from calibkit.report.imu_figures import allan, stands
+from calibkit.report.joint_figures import biases, imu_fit, way, whiteness
 from calibkit.report.look import ACCENT, INK, PALE
 from calibkit.report.rotation_figures import rates, residual_rate
 from calibkit.report.signals import frame_tilts
@@ -223,8 +224,8 @@ PICTURES = (
             "rise and fall of the rates is time offset.",
             frozenset({"rate", "of_rate", "t"}), 4.4, rates),
     Picture("residual_rate", "Residual against rotation",
-            "After alignment both are flat, at the height of the noise; what rises with the change of rate is time offset, with the rate "
-            "itself a wrong scale of a gyroscope or stamps that jitter.",
+            "Once aligned both are flat, at the height of the noise; what rises with the change of rate is time offset, with the rate "
+            "itself a wrong scale of a gyroscope, blur or stamps that jitter.",
             frozenset({"rate", "t"}), 3.4, residual_rate),
     Picture("offset_over_time", "Time offset over time",
             "Windows on the line, within their bars, are good; a slope is a clock that runs fast or slow, a step is frames or stamps that "
@@ -246,4 +247,19 @@ PICTURES = (
             "Cameras that look at the board from many sides, turned and tilted, are good; a wrong setup or direction of the poses shows as "
             "cameras that look elsewhere.",
             frozenset({"place", "rotation", "hand_eye"}), 5.2, poses_in_space),
+    Picture("imu_fit", "Measured and predicted",
+            "Squares on the line, and a level band of points of one height within the dashed lines, are good; a band that swells with the "
+            "motion is a wrong scale, axis or time, one that drifts a bias that moves more than its random walk says.",
+            frozenset({"measured", "t"}), 4.8, imu_fit),
+    Picture("whiteness", "Whiteness of what is left",
+            "Points within the band and a level spectrum are good (a dip at low frequencies is what the trajectory took along); a peak is "
+            "vibration, a rise towards low frequencies motion or a bias that the model does not follow.",
+            frozenset({"measured", "t"}), 3.4, whiteness),
+    Picture("biases", "Biases over time",
+            "Lines that stay level within their bands, or wander slowly, are good; a bias that swings with the motion stands for something "
+            "else: scale, a wrong axis, gravity.",
+            frozenset({"bias", "bias_sigma", "t"}), 3.2, biases),
+    Picture("way", "The way",
+            "Turns and moves in all three directions are good; a way along one line or in one plane leaves parts of the calibration open.",
+            frozenset({"bias", "place", "t"}), 3.3, way),
 )  # fmt: skip

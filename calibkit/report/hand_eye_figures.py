@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from calibkit.data.plural import counted
 from calibkit.geometry import se3, so3
 from calibkit.report.hand_eye_view import HandEye
-from calibkit.report.look import ACCENT, INK, PALE
+from calibkit.report.look import ACCENT, AXES, INK, PALE
 from calibkit.report.view import Array, Index, View, given
 
 MAX_BARS = 120
@@ -23,7 +23,6 @@ CLIPPED = 3.0  # times the largest kept residual; what is beyond is drawn at the
 ELLIPSE = 2.448  # sigmas of two dimensions that hold 95 %
 _MARKS = "os^Dv<>ph*"
 _SIDES = ((0, 1), (0, 2), (1, 2))
-_AXES = (("x", ACCENT, "-"), ("y", "#3f7d58", "--"), ("z", INK, ":"))
 
 
 def pose_residuals(figure: Figure, view: View) -> None:
@@ -217,7 +216,7 @@ def _few(n: int) -> Index:
 
 
 def _triads(panel: Any, T: Array, length: float, width: float) -> None:
-    for axis, (_, colour, dash) in enumerate(_AXES):
+    for axis, (_, colour, dash) in enumerate(AXES):
         panel.plot(*_strokes(T[:, :3, 3], T[:, :3, 3] + length * T[:, :3, axis]), color=colour, ls=dash, lw=width)
 
 

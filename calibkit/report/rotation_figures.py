@@ -54,7 +54,8 @@ def residual_rate(figure: Figure, view: View) -> None:
     order = np.argsort(given(view.t), kind="stable")
     order = order[view.kept[order]]
     rate, t = given(view.rate)[order], given(view.t)[order]
-    sizes = [(np.linalg.norm(view.raw[order], axis=1), "after: aligned", INK, "o", "-")]
+    label = "kept" if view.of_rate is None else "after: aligned"
+    sizes = [(np.linalg.norm(view.raw[order], axis=1), label, INK, "o", "-")]
     if view.before is not None:
         sizes.insert(0, (np.linalg.norm(view.before[order], axis=1), "before: stamps as they are", ACCENT, "s", "--"))
     axes = figure.subplots(1, 2, sharey=True)
@@ -91,14 +92,17 @@ def _cloud(panel: Axes, x: Array, size: Array, label: str, colour: str, marker: 
 
 
 def change(t: Array, rate: Array) -> Array:
-    """Return |d rate / dt| (n,) from the neighbours of each row, in order of time; NaN at both ends and beside a gap."""
+    """Return |d rate / dt| (n,) from the moments beside each row's, in order of time; NaN at both ends and beside a gap."""
+    t, first, moment = np.unique(t, return_index=True, return_inverse=True)  # the corners of a frame share theirs
+    rate = rate[first]
     found = np.full(len(t), np.nan)
     if len(t) > 2:
         step = np.diff(t)
         joined = (step > 0) & (step < 3 * np.median(step))
         fine = joined[1:] & joined[:-1]
         found[1:-1][fine] = np.abs(rate[2:] - rate[:-2])[fine] / (t[2:] - t[:-2])[fine]
-    return found
+    out: Array = found[moment]
+    return out
 
 
 def _busiest(t: Array, rate: Array, known: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> Index:

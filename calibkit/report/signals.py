@@ -12,6 +12,7 @@ from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.report.field import Repeating, cells, neighbour_correlation, over_image, over_radius
 from calibkit.report.hand_eye_signals import pose_shift, pose_turn, poses_dropped, second_axis
+from calibkit.report.joint_signals import alike, corners_fast, samples_fast
 from calibkit.report.probe import SIGNIFICANT, Measured, Probe, Signal
 from calibkit.report.time_offset_signals import over_before, rate_growth, window_scatter
 from calibkit.report.view import Array, View, given, rms
@@ -167,4 +168,10 @@ PROBES = (
           "many poses do not fit the others: look at those left out"),
     Probe("second_axis", "turn about a second axis", "deg", 8, -inf, frozenset({"motion"}), second_axis,
           "turns about one axis leave the translation along it open: tilt the mover about another axis by 30 deg or more"),
+    Probe("fast_corners", "frame's rms at the fastest turns over the slowest", "", 2, inf, frozenset({"uv", "frame", "rate"}), corners_fast,
+          "blur (shorten the exposure), a rolling shutter, or stamps that jitter"),
+    Probe("fast_samples", "residual at the fastest turns over the slowest", "", 1.5, inf, frozenset({"measured", "rate"}), samples_fast,
+          "a wrong scale or misaligned axes (calibkit imu), or samples that are late or early"),
+    Probe("autocorrelation", "autocorrelation of the residuals", "", 0.3, inf, frozenset({"measured", "t"}), alike,
+          "vibration, a filter in the IMU, or motion that the knots are too coarse for: plain sigmas are too small, and see the spectrum"),
 )  # fmt: skip

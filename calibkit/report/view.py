@@ -83,6 +83,9 @@ class View:
     rotation: Array | None = None  # (n, 4) xyzw of T_w1_1
     px: Array | None = None  # (n,) rms of the image's corners against the other side's pose
     motion: Array | None = None  # (n, 3) rad, rotation vector of a pair of poses
+    measured: Array | None = None  # (n, 3) what raw is left of
+    bias: Array | None = None  # (n, 6) rad/s, m/s^2 of an IMU at `place`
+    bias_sigma: Array | None = None  # (n, 6)
     hand_eye: HandEye | None = None  # the transform that these residuals are of
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
@@ -131,7 +134,7 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         if key in context:
             value = context[key].astype(float)
             good &= np.isfinite(value) & (value > 0)
-    for key in ("turn", "place", "rotation", "motion"):
+    for key in ("turn", "place", "rotation", "motion", "measured", "bias", "bias_sigma"):
         if key in context:
             value = context[key].astype(float)
             good &= value.ndim == 2 and np.all(np.abs(value) < _HUGE, axis=1)
@@ -207,6 +210,9 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         rotation=floats("rotation", 4),
         px=partly("px"),
         motion=floats("motion", 3),
+        measured=floats("measured", 3) if residuals.raw.shape[1] == 3 else None,
+        bias=floats("bias", 6),
+        bias_sigma=floats("bias_sigma", 6),
         hand_eye=hand_eye_of(result, residuals.sensor),
     )
 

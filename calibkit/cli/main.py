@@ -22,6 +22,7 @@ COMMANDS: tuple[str, ...] = (
     "timeoffset",
     "handeye",
     "joint",
+    "calibrate",
     "report",
     "import_",
     "export",

@@ -27,7 +27,7 @@ def build(summary: Summary) -> dict[str, bytes]:
     """Return the report's files by name: report.html, report.json and the pictures."""
     sections: dict[str, tuple[View, list[tuple[Picture, Markup]]]] = {}  # a sensor's sets under one heading
     images, pictures = {}, []
-    for view in summary.views:
+    for view in (*summary.views, *summary.earlier):
         drawn = draw(view)
         for one in drawn:
             name = _slug(view.sensor, view.stage, one.picture.key) + ".png"

@@ -28,6 +28,7 @@ class Summary:
     parameters: tuple[Row, ...]
     views: tuple[View, ...]
     signals: tuple[Signal, ...]
+    earlier: tuple[View, ...] = ()  # of entries that a later stage has made anew without residuals of its own: to be looked at
 
     @property
     def verdict(self) -> Verdict:
@@ -39,8 +40,11 @@ class Summary:
         return any(row.sigma_plain is not None for row in self.parameters)
 
 
-def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
-    """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once."""
+def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = ()) -> Summary:
+    """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once.
+
+    What `earlier` ones leave is looked at, not judged.
+    """
     seen = tuple(view for result in results for view in views(result))
     signals = tuple(signal for view in seen for signal in measure(view))
     said = tuple(reason for result in results for reason in result.reasons)
@@ -55,7 +59,9 @@ def summarise(rig: Rig, results: Sequence[Result]) -> Summary:
         said = (Reason(Verdict.PASS if judged else Verdict.CHECK, text),)
     order = list(Verdict)
     unique = sorted(dict.fromkeys(said), key=lambda reason: -order.index(reason.verdict))
-    return Summary(rig, tuple(results), tuple(unique), tuple(rows(rig)), seen, signals)
+    drawn = {view.sensor for view in seen}
+    old = tuple(view for result in earlier for view in views(result) if view.sensor not in drawn)
+    return Summary(rig, tuple(results), tuple(unique), tuple(rows(rig)), seen, signals, old)
 
 
 def _says(reason: Reason, name: str) -> bool:

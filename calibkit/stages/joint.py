@@ -59,7 +59,7 @@ def joint(
     board = load_target(target)
     recording = open_recording(list(sources), options.ros_distro, options.reading)
     topics = name_cameras(recording, _known(base, options.cameras))
-    name, topic = _name_imu(recording, base, options.imu)
+    name, topic = name_imu(recording, base, options.imu)
     lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
     samples = recording.imu(topic, progress)
     _refuse_imu(samples, name, topic)
@@ -98,7 +98,8 @@ def _known(base: Rig, asked: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{name}={camera.topic}" for name, camera in base.cameras.items() if camera.topic) if len(base.cameras) > 1 else ()
 
 
-def _name_imu(recording: Recording, base: Rig, asked: str | None) -> tuple[str, str]:
+def name_imu(recording: Recording, base: Rig, asked: str | None) -> tuple[str, str]:
+    """Return name and topic of the IMU asked for (topic, or NAME=/topic), else of the only one; named as the rig file has its topic."""
     name, _, topic = (asked or "").rpartition("=")
     chosen = recording.choose("imu", topic or None)
     by_topic = {imu.topic: key for key, imu in base.imus.items() if imu.topic}

@@ -25,8 +25,8 @@ def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None =
     if json_path is not None:
         refuse_unwritable(json_path, force)
     rig = load_rig(rig_path)
-    results = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
-    summary = summarise(rig, results)
+    results, earlier = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
+    summary = summarise(rig, results, earlier)
     if out_dir is not None:
         _write_pages(summary, out_dir)
     if json_path is not None:
@@ -55,14 +55,14 @@ def _latest_runs(rig: Rig) -> list[StageRun]:
     return list({run.residual_file: run for run in rig.provenance if run.residual_file is not None}.values())
 
 
-def _current(results: list[Result], rig_path: Path) -> list[Result]:
-    """Return what the results, oldest first, say of entries that no later one has made anew.
+def _current(results: list[Result], rig_path: Path) -> tuple[list[Result], list[Result]]:
+    """Return what the results, oldest first, say of entries that no later one has made anew, and the residuals of those that one has.
 
     BadInputError for an entry that was changed since it was made.
     """
     owner = {key: result for result in results for key in result.made}
     if not results:
-        return []
+        return [], []
     found = entry_hashes(results[0].rig)
     for key, result in owner.items():
         if key in found and found[key] != result.made[key]:
@@ -71,9 +71,10 @@ def _current(results: list[Result], rig_path: Path) -> list[Result]:
                 f"{rig_path.name}: {one_line(key, 80)} was changed since {stage} made it: "
                 f"its residuals no longer belong to it; run {stage} again"
             )
-    return [
-        _without(result, {key.split(".", 1)[-1] for key, made in result.made.items() if owner[key].made[key] != made}) for result in results
-    ]
+    gone = [{key.split(".", 1)[-1] for key, made in result.made.items() if owner[key].made[key] != made} for result in results]
+    pairs = list(zip(results, gone, strict=True))
+    earlier = [replace(result, residuals=tuple(set_ for set_ in result.residuals if set_.sensor in parts)) for result, parts in pairs]
+    return [_without(result, parts) for result, parts in pairs], earlier
 
 
 def _without(result: Result, parts: set[str]) -> Result:

@@ -1,11 +1,12 @@
 """Cameras and an IMU on one trajectory: what is measured when, the start, and the fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calibkit.data.observations import BoardViews, ImuSamples
+from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Camera
 from calibkit.errors import BadInputError
@@ -16,17 +17,19 @@ from calibkit.estimation.joint_fit import JointFit, fit_joint
 from calibkit.estimation.joint_knots import ORDER, Fineness, fineness
 from calibkit.estimation.joint_noise import sample_sigmas
 from calibkit.estimation.joint_problem import Frames, GravityPrior, ImuRows, JointProblem
-from calibkit.estimation.joint_seed import camera_beside, seed_trajectory
+from calibkit.estimation.joint_seed import CameraSeed, Posed, camera_beside, seed_camera, seed_trajectory
 from calibkit.estimation.lens_fit import dense_views, rows_of
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
 from calibkit.estimation.turns import in_order
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
-from calibkit.models.imu import STANDARD_GRAVITY
+from calibkit.models.cameras import CAMERAS
+from calibkit.models.imu import STANDARD_GRAVITY, ImuModel
 
 _STANDARD = GravityPrior(STANDARD_GRAVITY.value, STANDARD_GRAVITY.sigma)
 _LEAST_S = 1.0
+_FEWEST_FRAMES = 20
 _MARGIN_S = 0.01  # frames so near an end of the IMU's samples are left out: td may move
 
 
@@ -57,6 +60,8 @@ class CameraInput:
 class Settings:
     gravity: GravityPrior = _STANDARD
     spacing: float | None = None  # s, of the knots; None: chosen by the IMU's samples
+    imu: ImuModel = field(default_factory=ImuModel)  # scale, misalignment and sensitivity as known so far; its biases are not used
+    extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,7 @@ class Joint:
     origin_ns: int
     poses: tuple[BoardPoses, ...]
     turns: tuple[TimeOffsetFit, ...]
+    seeds: tuple[CameraSeed, ...]
     frames: tuple[Array, ...]  # per camera: rows of its views that took part
     fineness: Fineness
     rate_hz: float
@@ -87,14 +93,14 @@ def calibrate_joint(
     BadInputError where cameras and IMU share no time or cannot be brought together.
     """
     settings = settings or Settings()
-    order = in_order(imu.t_ns)
-    imu = imu.select(order)
-    poses = [board_poses(each.views, each.camera) for each in progress(cameras, "board poses", len(cameras))]
+    imu = imu.select(in_order(imu.t_ns))
+    poses = [_posed(each) for each in progress(cameras, "board poses", len(cameras))]
     turns = [fit_time_offset(turns_of_board(each), imu, TurnSettings()) for each in progress(poses, "time offset", len(poses))]
+    seeds = [seed_camera(pose, turn, imu) for pose, turn in zip(poses, turns, strict=True)]
     origin = turns[0].alignment.track.origin_ns
     t = (imu.t_ns - origin) * 1e-9
-    times = [(each.views.t_ns - origin) * 1e-9 for each in cameras]
-    seen = [at[each.frame] + turn.td for at, each, turn in zip(times, poses, turns, strict=True)]
+    times = [np.asarray((each.t_ns - origin) * 1e-9, np.float64) for each in poses]
+    seen = [at + seed.td for at, seed in zip(times, seeds, strict=True)]
     low = max(t[0], min(each.min() for each in seen) - 2 * _MARGIN_S)
     high = min(t[-1], max(each.max() for each in seen) + 2 * _MARGIN_S)
     if high - low < _LEAST_S:
@@ -108,24 +114,43 @@ def calibrate_joint(
     rows = ImuRows(t[inside], rates[:, :3], rates[:, 3:], *_noise(noise, rates, rate_hz), np.ones((len(rates), 2), bool))
 
     start, grids, used = None, [], []
-    for each, at, pose, turn in zip(cameras, times, poses, turns, strict=True):
-        frames = pose.frame[(at[pose.frame] + turn.td > low + _MARGIN_S) & (at[pose.frame] + turn.td < high - _MARGIN_S)]
-        lens = np.array([each.camera.parameters[name].value for name in each.camera.parameters], float)
-        grids.append(Frames(at[frames], _grid(each, frames)))
-        used.append(frames)
+    for each, pose, at, seed in zip(cameras, poses, times, seeds, strict=True):
+        inner = (at + seed.td > low + _MARGIN_S) & (at + seed.td < high - _MARGIN_S)
+        grids.append(Frames(at[inner], _grid(each, pose.frame[inner])))
+        used.append(pose.frame[inner])
+        order = np.flatnonzero(inner)[np.argsort(at[inner], kind="stable")]
+        posed = Posed(at[order], pose.T_cam_board[order], _lens(each.camera))
         start = (
-            seed_trajectory(knots, pose, lens, turn, rows.t, rows.accel, settings.gravity.size)
+            seed_trajectory(knots, posed, seed, rows.t, rows.accel, settings.gravity.size)
             if start is None
-            else camera_beside(start, knots, pose, lens, turn, origin)
+            else camera_beside(start, knots, posed, seed)
         )
     assert start is not None
     problem = JointProblem(
-        knots, cameras[0].views.board.points, rows, tuple(grids), settings.gravity, lens_priors=tuple(each.lens_prior for each in cameras)
+        knots,
+        cameras[0].views.board.points,
+        rows,
+        tuple(grids),
+        settings.gravity,
+        lens_priors=tuple(each.lens_prior for each in cameras),
+        extras=settings.extras,
     )
-    fit = fit_joint(problem, start)
+    fit = fit_joint(problem, replace(start, imu=settings.imu))
     told = (noise.gyro_noise_density is not None, noise.accel_noise_density is not None)
     walks = (noise.gyro_random_walk is not None, noise.accel_random_walk is not None)
-    return Joint(fit, origin, tuple(poses), tuple(turns), tuple(used), fine, rate_hz, told, walks)
+    return Joint(fit, origin, tuple(poses), tuple(turns), tuple(seeds), tuple(used), fine, rate_hz, told, walks)
+
+
+def _posed(each: CameraInput) -> BoardPoses:
+    poses = board_poses(each.views, each.camera)
+    if len(poses.frame) < _FEWEST_FRAMES:
+        of = f"{counted(each.views.n_images, 'image')} of {each.views.camera}"
+        raise BadInputError(f"{len(poses.frame)} of {of} show the board well enough: give {_FEWEST_FRAMES} or more, at 4 Hz or faster")
+    return poses
+
+
+def _lens(camera: Camera) -> Array:
+    return np.array([camera.parameters[name].value for name in CAMERAS[camera.model].parameter_names], float)
 
 
 def _grid(each: CameraInput, frames: Array) -> CameraViews:

@@ -15,7 +15,7 @@ from calibkit.solver.banded import Banded
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _GRAVITY_SCALE = 0.01  # m/s^2: 1 mrad of its direction
-_KNOWN_AT_LEAST = 1e-6  # of the information of a direction: the others' share noise pretends
+_KNOWN_AT_LEAST = 1e-3  # of a direction's information is not noise's: one draw of it does not tell less from none
 
 
 @dataclass(frozen=True)

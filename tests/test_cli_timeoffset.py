@@ -13,11 +13,11 @@ import pytest
 import yaml
 from commands import Run, Said
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from recorded_files import table, write_corners, write_imu, write_poses
 from recording_helper import Make, write
 from time_offset_samples import R_OF_TO, camera_session, constant_rate, lens, path, pose_imu, seen_gyro, seen_poses, stamps, wheels_imu
 
-from calibkit.data.observations import FeatureTracks, ImageFrame, ImuSamples, PoseSamples, Times
+from calibkit.data.observations import FeatureTracks, ImageFrame, ImuSamples, PoseSamples
 from calibkit.data.result import ResidualSet
 from calibkit.data.rig import Estimate, Rig
 from calibkit.data.transforms import make_time_offset, make_transform
@@ -29,7 +29,6 @@ from calibkit.io.residual_file import load_result
 from calibkit.io.rig_file import load_rig, save_rig
 from calibkit.io.target_file import dump_target
 from calibkit.report import page
-from calibkit.simulation.session import Session, simulate_views
 from calibkit.simulation.trajectory import Trajectory
 from calibkit.stages import sensor_turns
 
@@ -40,27 +39,6 @@ DURATION_S = 15.0
 
 
 # What the sensors of one rig saw, in files.
-
-
-def table(file: Path, header: str, t_ns: Times, *columns: NDArray[Any], form: str = "%.9f") -> Path:
-    rows = np.column_stack(columns)
-    lines = [f"{t}," + ",".join(form % value for value in row) for t, row in zip(t_ns, rows, strict=True)]
-    file.write_text("\n".join([header, *lines]) + "\n")
-    return file
-
-
-def write_imu(file: Path, imu: ImuSamples) -> Path:
-    return table(file, "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]", imu.t_ns, imu.gyro, imu.accel)
-
-
-def write_poses(file: Path, poses: PoseSamples) -> Path:
-    return table(file, "t [ns],x,y,z,qx,qy,qz,qw", poses.t_ns, poses.p, poses.q)
-
-
-def write_corners(file: Path, session: Session) -> Path:
-    views, _ = simulate_views(session)
-    columns = (views.t_ns[views.frame], views.corner // 4, views.corner % 4, views.uv)
-    return table(file, "t [ns],tag_id,corner_idx,u [px],v [px]", *columns, form="%.4f")
 
 
 class Files:

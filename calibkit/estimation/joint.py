@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.plural import counted
@@ -92,7 +93,11 @@ def calibrate_joint(
 
     BadInputError where cameras and IMU share no time or cannot be brought together.
     """
-    settings = settings or Settings()
+    with threadpool_limits(1, user_api="blas"):  # the matrices are small: threads of BLAS cost ten times what they bring
+        return _calibrate(cameras, imu, noise, settings or Settings(), progress)
+
+
+def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise, settings: Settings, progress: Progress) -> Joint:
     imu = imu.select(in_order(imu.t_ns))
     poses = [_posed(each) for each in progress(cameras, "board poses", len(cameras))]
     turns = [fit_time_offset(turns_of_board(each), imu, TurnSettings()) for each in progress(poses, "time offset", len(poses))]

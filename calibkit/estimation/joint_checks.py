@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
@@ -38,7 +39,8 @@ class Checks:
 
 def check_joint(fit: JointFit, halves: bool = True) -> Checks:
     """Return the checks."""
-    return Checks(board_scale(fit), _halves(fit) if halves else None)
+    with threadpool_limits(1, user_api="blas"):
+        return Checks(board_scale(fit), _halves(fit) if halves else None)
 
 
 def board_scale(fit: JointFit) -> tuple[float, float]:

@@ -1,11 +1,11 @@
 """How noisy each sensor is, by what the fit leaves: one variance factor for each kind of measurement (Foerstner 1979)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import JointState
+from calibkit.estimation.joint_parts import Part
 from calibkit.geometry.so3 import Array
 from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.banded import Banded
@@ -68,10 +68,10 @@ class Component:
         return float(np.sqrt(self.cost / max(self.rows - self.spent, 1.0)))
 
 
-def components(problem: JointProblem, x: JointState, drawn: Drawn) -> dict[str, Component]:
+def components(parts: Iterable[Part], drawn: Drawn) -> dict[str, Component]:
     """Return each kind's component: E d^T H_kind d = tr(H^-1 H_kind) for d ~ N(0, H^-1)."""
     found: dict[str, Component] = {}
-    for part in problem.parts(x):
+    for part in parts:
         d = np.concatenate(
             [drawn.core[part.columns], np.broadcast_to(drawn.border[part.touch], (len(part.first), len(part.touch), DRAWS))], axis=1
         )

@@ -7,7 +7,7 @@ walk   b_{j+1} - b_j ~ N(0, walk^2 h)
 (Furgale, Rehder, Siegwart 2013; the trajectory as in `geometry.spline`.)
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ from calibkit.geometry.spline import Knots, Steps, basis, turning
 from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.robust import cauchy
 
-_CHUNK = 4000  # IMU samples worked on at once: memory stays flat
+_CHUNK = 2000  # IMU samples worked on at once: memory stays flat
 # A trajectory that nothing measures stays as it moves: what moves more than this has sensors of its own to say so.
 _TURN_CHANGE, _ACCELERATION = 200.0, 100.0  # rad/s^2, m/s^2
 EXTRAS_OF_IMU = {name: size for name, size in EXTRAS.items() if name != LINE}
@@ -77,7 +77,11 @@ class JointProblem:
         return retract(x, self.border, core, border)
 
     def linearize(self, x: JointState) -> tuple[float, Arrowhead]:
-        cost, system = assemble(self.parts(x), self.knots.controls, self.knots.order, self.border.size)
+        return self.assembled(self.parts(x), x)
+
+    def assembled(self, parts: Iterable[Part], x: JointState) -> tuple[float, Arrowhead]:
+        """Return the cost and the normal equations of its parts at x."""
+        cost, system = assemble(parts, self.knots.controls, self.knots.order, self.border.size)
         if self.held:
             p = self.border.size
             return cost, Arrowhead(system.core, np.zeros_like(system.border), np.eye(p), system.gradient_core, np.zeros(p))

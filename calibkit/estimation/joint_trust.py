@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.joint_fit import JointFit
 from calibkit.estimation.joint_noise import schur
@@ -30,7 +31,11 @@ class Trust:
 
 def joint_trust(fit: JointFit) -> Trust:
     """Return the covariance of the calibration."""
-    scales = border_scales(fit)
+    with threadpool_limits(1, user_api="blas"):
+        return _trust(fit, border_scales(fit))
+
+
+def _trust(fit: JointFit, scales: Array) -> Trust:
     covariance = joint_covariance(fit, scales)
     values, vectors = np.linalg.eigh(fit.drawn.S * scales[:, None] * scales)
     root = scales[:, None] * vectors / np.sqrt(np.maximum(values, values[-1] * 1e-15))  # F F^T = S^-1

@@ -252,7 +252,7 @@ PICTURES = (
             "motion is a wrong scale, axis or time, one that drifts a bias that moves more than its random walk says.",
             frozenset({"measured", "t"}), 4.8, imu_fit),
     Picture("whiteness", "Whiteness of what is left",
-            "Points within the band and a level spectrum are good (a dip at low frequencies is what the trajectory took along); a peak is "
+            "Points within the band and a level spectrum are good (dips at low frequencies are what the trajectory took along); a peak is "
             "vibration, a rise towards low frequencies motion or a bias that the model does not follow.",
             frozenset({"measured", "t"}), 3.4, whiteness),
     Picture("biases", "Biases over time",

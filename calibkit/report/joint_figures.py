@@ -13,7 +13,7 @@ from calibkit.report.whiteness import autocorrelation, spectrum
 STRETCH_S = 1.5
 MAX_POINTS = 6000  # of a cloud
 FINE = 4
-MAX_BINS = 400  # of a spectrum: neighbouring lines are averaged
+MAX_BINS = 400  # of a spectrum, neighbouring lines are averaged; and of a curve of biases, which are slow
 
 
 def imu_fit(figure: Figure, view: View) -> None:
@@ -67,6 +67,7 @@ def whiteness(figure: Figure, view: View) -> None:
 def biases(figure: Figure, view: View) -> None:
     """Draw the biases over time with 3 sigma."""
     order = np.argsort(given(view.t), kind="stable")
+    order = order[:: 1 + len(order) // MAX_BINS]
     t, bias, sigma = given(view.t)[order], given(view.bias)[order], given(view.bias_sigma)[order]
     for panel, first, title, unit in zip(figure.subplots(1, 2), (0, 3), ("gyroscope", "accelerometer"), UNITS.values(), strict=True):
         for k, (name, colour, dash) in enumerate(AXES, first):

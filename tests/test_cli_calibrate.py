@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from commands import Run
 from recorded_files import write_corners, write_imu
 from time_offset_samples import camera_session, lens
@@ -19,9 +20,11 @@ from calibkit.errors import NotConvergedError
 from calibkit.geometry import se3
 from calibkit.io.rig_file import load_rig, save_rig
 from calibkit.io.target_file import dump_target
+from calibkit.opencv import cv2
 from calibkit.report import page
 from calibkit.simulation.session import Session
 from calibkit.stages import calibrate
+from calibkit.stages.convert import export_rig
 
 SAMPLES = Path(__file__).parent.parent / "sample_bags"
 TD = 0.025
@@ -81,6 +84,20 @@ def assert_true(path: Path, session: Session) -> None:
     assert abs(offset.value - TD) < 4 * offset.sigma < 1e-3
 
 
+def assert_exported(path: Path, session: Session, folder: Path) -> None:
+    """Kalibr's own keys: p_cam = T_cam_imu p_imu, t_imu = t_cam + timeshift_cam_imu; a point falls on the true pixel."""
+    export_rig(path, "kalibr", folder)
+    node = yaml.safe_load((folder / "camchain.yaml").read_text())["cam0"]
+    true = session.scenario.cameras[0]
+    p_imu = np.array([[0.3, -0.2, 0.1, 1.0]]) + true.T_imu_cam[:, 2]  # before the camera
+    p_cam = p_imu @ np.array(node["T_cam_imu"]).T
+    K, D = node["intrinsics"], node["distortion_coeffs"]
+    uv, _ = cv2.projectPoints(p_cam[:, :3], np.zeros(3), np.zeros(3), np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]), np.array(D))
+    p_true = p_imu @ se3.inverse(true.T_imu_cam).T
+    np.testing.assert_allclose(uv.reshape(2), true.model.project(p_true[0, :3], true.params).uv, atol=1.0)
+    assert node["timeshift_cam_imu"] == pytest.approx(TD, abs=1e-4)
+
+
 def test_from_a_recording_to_a_rig_file_and_one_report(
     run: Run, asked: tuple[object, ...], session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,6 +114,7 @@ def test_from_a_recording_to_a_rig_file_and_one_report(
         ("cam0", "joint"), ("imu0_gyro", "joint"), ("imu0_accel", "joint"), ("imu0", "joint"), ("dt_imu0_cam0", "timeoffset")
     ]  # fmt: skip
     assert "A later stage has found this anew" in (pages / "report.html").read_text()
+    assert_exported(out, session, tmp_path / "kalibr")
     told = json.loads(js.read_text())
     assert (told["verdict"], told["not_observable"]) == ("CHECK", [])  # no noise of the IMU is known
     assert NO_WALKS in said.out

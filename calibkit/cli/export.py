@@ -13,7 +13,7 @@ def register(app: typer.Typer) -> None:
 
 def run(
     rig: Annotated[Path, typer.Argument(help="Rig file.")],
-    to: Annotated[str, typer.Option("--to", help="kalibr, openvins, ros or opencv.")],
+    to: Annotated[str, typer.Option("--to", help="kalibr, openvins, vins, ros or opencv.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; made where it is missing.")],
     lossy: Annotated[bool, typer.Option("--lossy", help="Accept a camera model that is off by more than 0.1 px.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files.")] = False,

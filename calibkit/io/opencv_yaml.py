@@ -79,7 +79,8 @@ def camera_matrix(params: Array) -> list[float]:
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
-def _matrix(name: str, rows: int, cols: int, data: list[float]) -> str:
+def matrix_text(name: str, rows: int, cols: int, data: list[float]) -> str:
+    """Return a matrix as cv::FileStorage reads it."""
     numbers = ", ".join(map(repr, data))
     return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
 
@@ -90,8 +91,8 @@ def _text(name: str, camera: Camera) -> str:
     return (
         f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n"
         f"fisheye_model: {int(camera.model in _FISHEYE.values())}\n"
-        + _matrix("camera_matrix", 3, 3, camera_matrix(params))
-        + _matrix("distortion_coefficients", len(params) - 4, 1, params[4:].tolist())
+        + matrix_text("camera_matrix", 3, 3, camera_matrix(params))
+        + matrix_text("distortion_coefficients", len(params) - 4, 1, params[4:].tolist())
     )
 
 

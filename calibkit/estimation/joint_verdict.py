@@ -7,7 +7,9 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint_causes import WORDS, jittering, wrong_axes
 from calibkit.estimation.joint_checks import Checks
+from calibkit.estimation.joint_seed import STAMPS
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
 from calibkit.estimation.stamps import StampReport
@@ -22,7 +24,7 @@ _GRAVITY_OFF = 4.0  # sigmas of what was told
 _SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
 _HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
 _MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
-_WORDS = {"gyro": "gyroscope", "accel": "accelerometer"}
+_OTHER_CLOCK_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ def judge_joint(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ..
     border = fit.problem.border
     sigma = np.sqrt(np.diag(trust.cov)) / trust.scales
     statuses = [Status(grade(s)) for s in sigma]
-    reasons: dict[str, tuple[Reason, ...]] = {"": _of_all(joint, trust, checks, imu)}
+    jitter = [jittering(joint, c, name, stamps) for c, name in enumerate(names)]
+    reasons: dict[str, tuple[Reason, ...]] = {"": ()}
     opens = []
     for c, name in enumerate(names):
         T, dt = f"T_{name}_{imu}", f"dt_{imu}_{name}"
@@ -63,9 +66,33 @@ def judge_joint(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ..
         known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
         reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
         judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
-        reasons[dt] += tuple(reason for reason in judged.others if statuses[k] is not Status.NOT_OBSERVABLE)
-        reasons[name] = _of_camera(joint, trust, names, c)
+        if statuses[k] is not Status.NOT_OBSERVABLE:
+            reasons[dt] += (*_of_offset(joint, c, dt, name, imu), *judged.others)
+        cause = jitter[c]  # what follows from it is not told
+        reasons[name] = (*_of_lens(joint, trust, names, c), *(_of_corners(joint, names, c) if cause is None else (cause,)))
+        if cause is not None:
+            reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
+    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter))
+    reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, names))}
     return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
+
+
+def _rank(key: str, names: tuple[str, ...]) -> int:
+    """Return the order in which reasons are told: sensors first, whose faults leave directions open."""
+    return 0 if not key else 1 if key in names else 2
+
+
+def _of_offset(joint: Joint, c: int, dt: str, name: str, imu: str) -> tuple[Reason, ...]:
+    found = []
+    size = joint.fit.x.cameras[c].dt
+    if abs(size) > _OTHER_CLOCK_S:
+        text = f"{dt}: {size:.3f} s is more than any delay: {name} and {imu} have clocks of different origins"
+        found.append(Reason(Verdict.CHECK, f"{text}: it will be another one at the next start"))
+    second = joint.turns[c].second
+    if joint.seeds[c].td_by == STAMPS and second is not None:
+        text = f"{dt}: {second * 1e3:+.1f} ms may fit as well as {size * 1e3:+.1f} ms: the motion repeats itself; turn irregularly"
+        found.append(Reason(Verdict.FAIL, text))
+    return tuple(found)
 
 
 def _open_text(each: Open) -> str:
@@ -74,7 +101,7 @@ def _open_text(each: Open) -> str:
     return f"{each.text} is {cause}: {mend}"
 
 
-def _of_camera(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:
+def _of_lens(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:
     fit, name = joint.fit, names[c]
     where = fit.problem.border[f"lens {c}"]
     model = fit.problem.cameras[c].views.model
@@ -87,6 +114,11 @@ def _of_camera(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tu
             found.append(
                 Reason(_VERDICTS[status], f"{name}: {', '.join(those)} {'is' if len(those) == 1 else 'are'} {status.value}: {mend}")
             )
+    return tuple(found)
+
+
+def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:
+    fit, name, found = joint.fit, names[c], []
     weight, kept = fit.found[c], fit.problem.cameras[c].views.weight > 0
     lost = 1 - kept.sum() / max(weight.sum(), 1)
     if lost > _LOST:
@@ -101,35 +133,19 @@ def _of_camera(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tu
     return tuple(found)
 
 
-def _of_all(joint: Joint, trust: Trust, checks: Checks, imu: str) -> tuple[Reason, ...]:
+def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool) -> tuple[Reason, ...]:
     fit = joint.fit
     found = []
     if not fit.converged:
         found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
-    for i, kind in enumerate(("gyro", "accel")):
-        factor, (check, fail) = fit.factors[kind], _NOISIER[kind]
-        if joint.densities_told[i] and factor > check:
-            text = f"{imu}'s {_WORDS[kind]} is {factor:.1f} times noisier than its noise density says: vibration, a wrong unit or density?"
-            found.append(Reason(Verdict.FAIL if factor > fail else Verdict.CHECK, text))
-        lost = 1 - float(np.mean(fit.problem.imu.keep[:, i]))
-        if lost > _LOST:
-            verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
-            found.append(
-                Reason(
-                    verdict, f"{100 * lost:.0f} % of the samples of {imu}'s {_WORDS[kind]} fit no smooth motion: shocks, or wrong samples"
-                )
-            )
-    prior = fit.problem.gravity
-    off = float(np.linalg.norm(fit.x.gravity)) - prior.size
-    if abs(off) > _GRAVITY_OFF * prior.sigma:
-        text = (
-            f"gravity comes out as {off + prior.size:.3f} m/s^2: {imu}'s accelerometer has a wrong scale or unit, or the board another size"
-        )
-        found.append(Reason(Verdict.FAIL, text))
-    scale, sigma = checks.board_scale
-    if abs(scale - 1) > max(_SCALE_OFF, _SURE * sigma):
-        text = f"the board seems {scale:.4f} +- {sigma:.2g} times the size that its file says, by {imu}'s accelerations"
-        found.append(Reason(Verdict.FAIL, f"{text}: measure it, or check {imu}'s scale"))
+    wrong = {kind: wrong_axes(joint, kind, imu) if fit.factors[kind] > _NOISIER[kind][0] else "" for kind in WORDS}
+    for i, kind in enumerate(WORDS):
+        if wrong[kind]:
+            found.insert(0, Reason(Verdict.FAIL, wrong[kind]))
+        elif not jitter:
+            found += _of_samples(joint, i, kind, imu)
+    if not wrong["accel"]:
+        found += _of_scale(joint, checks, imu)
     if not np.all(joint.walks_told):
         text = f"{imu} has no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
         found.append(Reason(Verdict.CHECK, text))
@@ -145,6 +161,37 @@ def _of_all(joint: Joint, trust: Trust, checks: Checks, imu: str) -> tuple[Reaso
             )
         )
     return tuple(found)
+
+
+def _of_scale(joint: Joint, checks: Checks, imu: str) -> list[Reason]:
+    fit, found = joint.fit, []
+    prior = fit.problem.gravity
+    off = float(np.linalg.norm(fit.x.gravity)) - prior.size
+    if abs(off) > _GRAVITY_OFF * prior.sigma:
+        text = (
+            f"gravity comes out as {off + prior.size:.3f} m/s^2: {imu}'s accelerometer has a wrong scale or unit, or the board another size"
+        )
+        found.append(Reason(Verdict.FAIL, text))
+    scale, sigma = checks.board_scale
+    if abs(scale - 1) > max(_SCALE_OFF, _SURE * sigma):
+        text = f"the board seems {scale:.4f} +- {sigma:.2g} times the size that its file says, by {imu}'s accelerations"
+        found.append(Reason(Verdict.FAIL, f"{text}: measure it, or check {imu}'s scale"))
+    return found
+
+
+def _of_samples(joint: Joint, i: int, kind: str, imu: str) -> list[Reason]:
+    found = []
+    factor, (check, fail) = joint.fit.factors[kind], _NOISIER[kind]
+    if factor > check:
+        than = "its noise density says" if joint.densities_told[i] else "its samples scatter from one to the next"
+        text = f"{imu}'s {WORDS[kind]} is {factor:.1f} times noisier than {than}: vibration, a wrong unit or density?"
+        found.append(Reason(Verdict.FAIL if factor > fail else Verdict.CHECK, text))
+    lost = 1 - float(np.mean(joint.fit.problem.imu.keep[:, i]))
+    if lost > _LOST:
+        verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
+        text = f"{100 * lost:.0f} % of the samples of {imu}'s {WORDS[kind]} fit no smooth motion: shocks, or wrong samples"
+        found.append(Reason(verdict, text))
+    return found
 
 
 def known(statuses: tuple[Status, ...], where: slice) -> Status:

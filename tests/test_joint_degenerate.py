@@ -1,0 +1,120 @@
+"""What a motion leaves open is named and never given as a number; what it tells is right; rich motion raises no alarm."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from joint_samples import Recording, error_of, recorded
+
+from calibkit.data.result import Result
+from calibkit.data.verdict import Status, Verdict
+from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint_trust import joint_trust
+
+T, DT = "T_cam0_imu0", "dt_imu0_cam0"
+P, R = ("p_x", "p_y", "p_z"), ("r_x", "r_y", "r_z")
+
+
+def told(seed: int, motion: str) -> tuple[Recording, Joint, Result]:
+    recording = recorded(seed, motion=motion)
+    joint = recording.fitted()
+    return recording, joint, recording.result(joint)
+
+
+def right(recording: Recording, joint: Joint, part: slice) -> bool:
+    """Whether parameters of T_cam_imu (rho, phi) and dt, in that order, lie within 4 sigma of the truth."""
+    first = joint.fit.problem.border["T 0"].start
+    where = slice(first + part.start, first + part.stop)
+    sigma = np.sqrt(np.diag(joint_trust(joint.fit).cov))[where]
+    return bool(np.all(np.abs(error_of(recording, joint)[where]) < 4 * sigma))
+
+
+def unknown(result: Result) -> set[str]:
+    """Return the parts of T and dt that are not observable."""
+    return {name.split(".")[1] for name in result.not_observable if name.startswith((T, DT))}
+
+
+def opened(result: Result) -> list[str]:
+    return [reason.text for reason in result.reasons if reason.text.startswith(f"{T}: ") and "is not observable" in reason.text]
+
+
+def translation(recording: Recording, joint: Joint, result: Result) -> None:
+    """The lever arm alone: accelerations tell rotation and offset."""
+    assert unknown(result) == set(P)
+    assert len(opened(result)) == 3
+    assert all(f"p of {T} along" in text and "turn about" in text for text in opened(result))
+    assert right(recording, joint, slice(3, 7))
+    assert abs(joint.fit.x.cameras[0].dt - recording.td) < 5e-4
+    assert np.linalg.norm(error_of(recording, joint)[joint.fit.problem.border["T 0"]][3:]) < 5e-3
+
+
+def single_axis(recording: Recording, joint: Joint, result: Result) -> None:
+    """Turns about the camera's y, nearly the IMU's x, without translation: p along it, and R about it."""
+    texts = opened(result)
+    assert len(texts) == 2
+    assert any(f"p of {T} along the imu0's x axis" in text for text in texts)
+    assert any(f"R of {T} about the imu0's x axis" in text for text in texts)
+    assert DT not in str(result.not_observable)
+    assert right(recording, joint, slice(6, 7))
+
+
+def planar(recording: Recording, joint: Joint, result: Result) -> None:
+    """A vehicle on flat ground: only p along the axis of its turns, the camera's y, nearly the IMU's x."""
+    texts = opened(result)
+    assert len(texts) == 1
+    assert f"p of {T} along the imu0's x axis" in texts[0]
+    assert unknown(result) == {"p_y"}
+    assert right(recording, joint, slice(3, 7))
+
+
+def nothing(recording: Recording, joint: Joint, result: Result) -> None:
+    """At rest and gliding: nothing at all."""
+    assert unknown(result) == {*P, *R, "offset"}
+    assert len(opened(result)) == 6
+    assert result.rig.time_offsets[DT].offset.value is None
+
+
+MOTIONS: dict[str, Callable[[Recording, Joint, Result], None]] = {
+    "translation": translation,
+    "single-axis": single_axis,
+    "planar": planar,
+    "static": nothing,
+    "constant-velocity": nothing,
+}
+
+
+def check(motion: str, seed: int) -> None:
+    recording, joint, result = told(seed, motion)
+    assert result.exit_code == 3
+    assert result.rig.transforms[T].status is Status.NOT_OBSERVABLE
+    MOTIONS[motion](recording, joint, result)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_what_a_motion_leaves_open_is_named(motion: str, seed: int) -> None:
+    check(motion, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 20))
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_what_a_motion_leaves_open_is_named_over_many_seeds(motion: str, seed: int) -> None:
+    check(motion, seed)
+
+
+def no_alarm(seed: int) -> None:
+    recording = recorded(seed)
+    result = recording.result(recording.fitted(), halves=True)
+    assert result.verdict is Verdict.PASS and result.exit_code == 0, [reason.text for reason in result.reasons]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rich_motion_raises_no_alarm(seed: int) -> None:
+    no_alarm(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3, 100))
+def test_rich_motion_raises_no_alarm_over_many_seeds(seed: int) -> None:
+    no_alarm(seed)

@@ -13,6 +13,12 @@ class BadInputError(CalibkitError):
     exit_code = 2
 
 
+class NotObservableError(CalibkitError):
+    """This recording does not tell anything of what was asked for; nothing was written."""
+
+    exit_code = 3
+
+
 class NotConvergedError(CalibkitError):
     """The estimator found no answer; nothing was written."""
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Run
+from numpy.typing import NDArray
 from test_hand_eye import ONLY_X, SIGMA_P, SIGMA_R, noisy, poses, recorded, spread
 
 from calibkit.data.result import Thumbnail
 from calibkit.data.verdict import Verdict, worst
-from calibkit.errors import BadInputError
+from calibkit.errors import NotObservableError
 from calibkit.estimation.hand_eye import calibrate_hand_eye
 from calibkit.estimation.hand_eye_data import of_recording
 from calibkit.estimation.hand_eye_doubts import strangers
@@ -21,6 +22,7 @@ from calibkit.geometry import se3
 from calibkit.io.residual_file import load_result
 from calibkit.io.rig_file import load_rig
 
+Array = NDArray[np.float64]
 SAMPLE = Path(__file__).resolve().parent.parent / "sample_bags"
 ASKED = (SAMPLE / "hand_eye", "--target", SAMPLE / "target.yaml", "--model", "pinhole-radtan")
 
@@ -105,7 +107,7 @@ def test_a_board_of_another_size_is_told_with_its_sigma_and_no_other() -> None:
         found = stretch(wrong.data, wrong.refined, wrong.trusted.inflation)
         assert found is not None
         assert abs(found.factor - 1 / 1.05) < min(4 * found.sigma, 0.01)
-        reasons = judge_hand_eye("T_gripper_cam", wrong, (), Doubts(), "refined")
+        reasons = judge_hand_eye("T_gripper_cam", wrong, (), Doubts(), "refined").reasons
         said = " ".join(reason.text for reason in reasons)
         off = se3.local(wrong.X, fit.X)
         assert np.linalg.norm(found.moves[:3] - off[:3]) < 0.3 * np.linalg.norm(off[:3]) + 1e-3
@@ -128,5 +130,49 @@ def test_what_else_could_fit_is_told_with_the_choice() -> None:
     assert "if the camera is on the gripper, the poses are the other way round: --setup eye-in-hand --inverse-poses" in choice.unconfirmed
     fits = {setup: calibrate_hand_eye(of_recording(setup, G, seen), ONLY_X) for setup in both}
     assert "--setup eye-to-hand --inverse-poses" in choose_fit(fits).unconfirmed
-    with pytest.raises(BadInputError, match="do not tell"):
+    with pytest.raises(NotObservableError, match="do not tell"):
         choose_fit({"eye-in-hand": fits["eye-in-hand"], "eye-to-hand": fits["eye-in-hand"]})
+
+
+def rows_of(folder: Path, **sides: Array) -> list[Path | str]:
+    """Files of 16 numbers a row, and the words that name them as pairs."""
+    out: list[Path | str] = []
+    for name, T in sides.items():
+        np.savetxt(folder / f"{name}.txt", T.reshape(len(T), 16), fmt="%.12g")
+        out += ["--pairs", folder / f"{name}.txt"]
+    return out
+
+
+def test_the_same_poses_on_both_sides_are_refused(run: Run, tmp_path: Path) -> None:
+    G = spread(np.random.default_rng(0), 12)
+    for second in (G, se3.inverse(G)):
+        for words in ((), ("--setup", "motion"), ("--setup", "eye-in-hand"), ("--motions",)):
+            said = run("handeye", *rows_of(tmp_path, a=G, b=second), *words, "-o", tmp_path / "never.yaml")
+            assert "a.txt, b.txt: both sides have the same poses" in said.mistake
+            assert "was one file or topic given twice?" in said.mistake
+    assert not (tmp_path / "never.yaml").exists()
+
+
+def test_a_setup_that_three_poses_do_not_tell_is_not_observable(run: Run, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    _, data, _ = recorded("eye-in-hand", spread(rng, 3), rng)
+    asked = rows_of(tmp_path, robot=data.P, board=se3.inverse(data.Q))
+    said = run("handeye", *asked, "-o", tmp_path / "never.yaml")
+    assert (said.code, said.out) == (3, "")
+    assert "3 poses do not tell" in said.err
+    assert "10 or more are needed; or give --setup" in said.err
+    assert not (tmp_path / "never.yaml").exists()
+    assert run("handeye", *asked, "--setup", "eye-in-hand").code == 0
+
+
+def test_images_with_brackets_in_their_names_are_found(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "shots[1]"
+    folder.mkdir()
+    for image in (SAMPLE / "hand_eye").glob("im_*.jpg"):
+        (folder / f"im[{image.stem[-2:]}].jpg").write_bytes(image.read_bytes())
+    poses_csv = re.sub(r"im_(\d\d)\.jpg", r"im[\1].jpg", (SAMPLE / "hand_eye/poses.csv").read_text())
+    (tmp_path / "poses.csv").write_text(poses_csv)
+    said = run("handeye", folder, *ASKED[1:], "--poses", tmp_path / "poses.csv", "-o", tmp_path / "rig.yaml")
+    assert said.code == 0, said
+    assert "20 poses found by file name" in said.out
+    assert any(picture.label.startswith("im[") for picture in pictures(tmp_path / "rig.yaml"))

@@ -10,7 +10,9 @@ from calibkit.data.progress import silent
 from calibkit.data.verdict import Status
 from calibkit.estimation.board_poses import BoardPoses, board_poses
 from calibkit.estimation.hand_eye import HandEyeFit, calibrate_hand_eye
+from calibkit.estimation.hand_eye_arm import by_pose, pattern_of
 from calibkit.estimation.hand_eye_data import of_recording
+from calibkit.estimation.hand_eye_explained import left_of
 from calibkit.estimation.intrinsics import CameraRequest, calibrate_cameras
 from calibkit.geometry import se3, so3
 from calibkit.io.recording import open_recording
@@ -56,6 +58,19 @@ def test_kuka2_is_what_park_gives_with_a_smaller_sigma(boards: tuple[BoardPoses,
     assert 1e3 * result.scatter.distance < SCATTER_MM
     assert result.statuses == {"p": Status.DETERMINED, "R": Status.DETERMINED}
     assert not result.open
+
+
+def test_kuka2_has_no_pattern_large_enough_to_tell(boards: tuple[BoardPoses, np.ndarray]) -> None:
+    """Its arm's errors depend on its pose beyond any chance, by 0.45 mm and 0.6 mrad: less than X must be known to."""
+    result = fit(boards)
+    left = left_of(result)
+    assert left is not None
+    found = left.by(by_pose(left))
+    assert found is not None
+    assert found.chance < 1e-9
+    assert found.distance < 1e-3
+    assert found.angle < 1e-3
+    assert pattern_of(result) is None
 
 
 def test_kuka2_shows_andreffs_failure_and_that_the_others_agree(boards: tuple[BoardPoses, np.ndarray]) -> None:

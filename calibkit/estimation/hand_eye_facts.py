@@ -8,13 +8,17 @@ from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_asked import Asked
 from calibkit.estimation.hand_eye_compared import Method
 from calibkit.estimation.hand_eye_doubts import Suspect
+from calibkit.estimation.hand_eye_known import doubted
 from calibkit.estimation.hand_eye_lines import weakest_sigmas, worst_pairs
 from calibkit.geometry.so3 import Array
 
 
-def facts(fit: HandEyeFit, asked: Asked, wrong: tuple[Suspect, ...], predicted: Array | None, fixed: str) -> dict[str, object]:
+def facts(
+    fit: HandEyeFit, asked: Asked, wrong: tuple[Suspect, ...], predicted: Array | None, fixed: str, contradicted: bool
+) -> dict[str, object]:
     """Return everything in SI units, for machines."""
     data, spectrum = fit.data, fit.spectrum
+    statuses = {part: doubted(status) if contradicted else status for part, status in fit.statuses.items()}
     return {
         "setup": data.setup,
         "frames": list(data.words.frames),
@@ -26,7 +30,7 @@ def facts(fit: HandEyeFit, asked: Asked, wrong: tuple[Suspect, ...], predicted: 
         "X": fit.X.tolist(),
         "X_covariance": fit.cov_X.tolist(),
         "X_covariance_plain": fit.plain_cov_X.tolist(),
-        "status": {part: status.value for part, status in fit.statuses.items()},
+        "status": {part: status.value for part, status in statuses.items()},
         "fixed_transform": fixed,
         "scatter": {"angle": fit.scatter.angle, "distance": fit.scatter.distance},
         "noise": {key: _finite(value) for key, value in fit.noise.items()},

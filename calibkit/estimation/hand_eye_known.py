@@ -37,6 +37,11 @@ def position_covariance(X: Array, cov: Array) -> Array:
     return out
 
 
+def doubted(status: Status) -> Status:
+    """Return a status of what is told by poses that no X fits: such sigmas determine nothing."""
+    return Status.WEAK if status is Status.DETERMINED else status
+
+
 def parameter_statuses(X: Array, cov: Array) -> dict[TransformParameter, Status]:
     """Return the status of p and of log R by component, that of no better than the least known direction's.
 

@@ -12,10 +12,10 @@ from calibkit.estimation.hand_eye import HandEyeFit
 from calibkit.estimation.hand_eye_asked import Asked
 from calibkit.estimation.hand_eye_doubts import suspects
 from calibkit.estimation.hand_eye_facts import facts
-from calibkit.estimation.hand_eye_known import parameter_statuses
+from calibkit.estimation.hand_eye_known import doubted, parameter_statuses
 from calibkit.estimation.hand_eye_lines import lines, methods_table
 from calibkit.estimation.hand_eye_normal import SCALES
-from calibkit.estimation.hand_eye_verdict import judge_hand_eye
+from calibkit.estimation.hand_eye_verdict import Judged, judge_hand_eye
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import directions
@@ -28,11 +28,12 @@ def hand_eye_result(fit: HandEyeFit, asked: Asked) -> Result:
     one, two, w1, w2 = fit.data.words.frames
     name, fixed = f"T_{one}_{two}", f"T_{w1}_{w2}"
     wrong = suspects(fit)
-    reasons = judge_hand_eye(name, fit, wrong, asked.doubts, asked.method)
+    judged = judge_hand_eye(name, fit, wrong, asked.doubts, asked.method)
+    reasons = judged.reasons
     texts = [reason.text.removeprefix(f"{name}: ") for reason in reasons]
-    entries = {name: _entry(one, two, fit.X, fit.cov_X, verdict=worst(reasons), reasons=texts)}
+    entries = {name: _entry(one, two, fit.X, fit.cov_X, judged, texts)}
     if fit.Z is not None and fit.cov_Z is not None:
-        entries[fixed] = _entry(w1, w2, fit.Z, fit.cov_Z, verdict=worst(reasons))
+        entries[fixed] = _entry(w1, w2, fit.Z, fit.cov_Z, judged)
     unknown = {key: _unknown(entry) for key, entry in entries.items()}
     if unknown.get(fixed):
         reasons += (Reason(Verdict.FAIL, f"{fixed}: not observable, by the same poses: {', '.join(unknown[fixed])}"),)
@@ -43,7 +44,7 @@ def hand_eye_result(fit: HandEyeFit, asked: Asked) -> Result:
         reasons=reasons,
         residuals=(_pose_set(name, fit, asked), _pair_set(name, fit)),
         facts={
-            "hand_eye": {name: facts(fit, asked, wrong, predicted, fixed)},
+            "hand_eye": {name: facts(fit, asked, wrong, predicted, fixed, judged.contradicted)},
             "frame_labels": {name: [one_line(label, 100) for label in fit.data.labels]},
             "lines": [*asked.lines, *lines(name, fixed, fit, asked, wrong, predicted)],
             "tables": [methods_table(fixed, fit)] if fit.methods else [],
@@ -52,9 +53,11 @@ def hand_eye_result(fit: HandEyeFit, asked: Asked) -> Result:
     )
 
 
-def _entry(a: str, b: str, T: Array, cov: Array, verdict: Verdict, reasons: list[str] | None = None) -> Transform:
-    status = Status(directions(cov, SCALES)[0].grade)
-    return make_transform(a, b, T, cov, status, statuses=parameter_statuses(T, cov), verdict=verdict, reasons=reasons or [])
+def _entry(a: str, b: str, T: Array, cov: Array, judged: Judged, reasons: list[str] | None = None) -> Transform:
+    status, statuses = Status(directions(cov, SCALES)[0].grade), parameter_statuses(T, cov)
+    if judged.contradicted:
+        status, statuses = doubted(status), {key: doubted(value) for key, value in statuses.items()}
+    return make_transform(a, b, T, cov, status, statuses=statuses, verdict=worst(judged.reasons), reasons=reasons or [])
 
 
 def _unknown(entry: Transform) -> list[str]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.data.plural import counted, plain
-from calibkit.errors import BadInputError
+from calibkit.errors import BadInputError, NotObservableError
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye, select
 from calibkit.estimation.hand_eye_data import HandEyeData
 from calibkit.estimation.hand_eye_doubts import misfit, strangers
@@ -20,6 +20,7 @@ from calibkit.geometry.so3 import Array
 
 _TRIED_ON = 200  # poses
 _FEW = 10  # poses, that more of are asked for
+_COPY = 1e-6  # m and rad: files keep as many digits
 _CHECK = "which pose belongs to which image, --pose-format, --angle-unit, and the board"
 # Whether P and Q are what was recorded or their inverses (hand_eye_world.SETUPS).
 SIGNS = {"eye-in-hand": (1, -1), "eye-to-hand": (-1, -1), "motion": (1, 1)}
@@ -50,10 +51,20 @@ class Choice:
     times: float = 1.0
 
 
+def refuse_copies(first: Array, second: Array) -> None:
+    """Raise BadInputError where both sides are the same poses (n, 4, 4), or their inverses: no two sensors agree so well."""
+    moves = np.ptp(first, axis=0).max(initial=0) > _COPY
+    if moves and any(np.allclose(first, other, rtol=0, atol=_COPY) for other in (second, se3.inverse(second))):
+        raise BadInputError(
+            "both sides have the same poses, whose X would be the identity without any error: was one file or topic given twice? "
+            "give the second sensor's poses, or the board's"
+        )
+
+
 def choose_setup(first: Array, second: Array, asked: str | None, candidates: Sequence[str]) -> Choice:
     """Return the setup asked for or the one candidate that leaves far less, from T_base_gripper and T_cam_target (n, 4, 4).
 
-    BadInputError where none does clearly.
+    NotObservableError where none does clearly; BadInputError where the sides do not belong together, or no poses tell candidates apart.
     """
     if strangers(first, second):
         check = "that both are of one body and one recording" if tuple(candidates) == ("motion",) else _CHECK
@@ -72,7 +83,8 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
         if len(able) > 1:
             few = len(first) < _FEW
             who, more = (f"{counted(len(first), 'pose')} do", "10 or more are needed; or ") if few else ("the poses do", "")
-            raise BadInputError(f"{who} not tell {' from '.join(able)}: {more}give --setup {' or '.join(able)}")
+            text = f"{who} not tell {' from '.join(able)}: {more}give --setup {' or '.join(able)}"
+            raise NotObservableError(text) if times < CLEARLY else BadInputError(text)  # of the same sign no poses tell them apart
         asked = able[0]
         if len(candidates) > 1:
             others = [setup for setup in candidates if setup != asked]
@@ -83,14 +95,14 @@ def choose_setup(first: Array, second: Array, asked: str | None, candidates: Seq
 
 
 def choose_fit(fits: Mapping[str, HandEyeFit]) -> Choice:
-    """Return the setup whose own pairs leave far less; BadInputError where none does clearly."""
+    """Return the setup whose own pairs leave far less; NotObservableError where none does clearly."""
     left = {setup: misfit(fit) for setup, fit in fits.items()}
     ranked = sorted(left, key=lambda setup: left[setup])
     if len(ranked) == 1:
         return Choice(ranked[0])
     times = left[ranked[1]] / left[ranked[0]]
     if times < CLEARLY:
-        raise BadInputError(f"the poses do not tell {' from '.join(ranked)}: give --setup {' or '.join(ranked)}")
+        raise NotObservableError(f"the poses do not tell {' from '.join(ranked)}: give --setup {' or '.join(ranked)}")
     return Choice(ranked[0], _chosen(ranked[0], times, ranked[1:2]), _unconfirmed(ranked[0], ranked[1:2]))
 
 

@@ -8,6 +8,7 @@ from calibkit.data.plural import counted, plain
 from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import one_line
 from calibkit.estimation.hand_eye import HandEyeFit
+from calibkit.estimation.hand_eye_arm import Pattern, pattern_of
 from calibkit.estimation.hand_eye_doubts import Suspect
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.hand_eye_lag import stretch
@@ -19,6 +20,7 @@ _MANY_WRONG = 0.4  # of the poses: who is right is then a matter of opinion
 _FEW_ENOUGH = 200  # poses, to name those that are wrong
 _NAMED = 4
 _OFF, _OFF_SIGMAS = 3e-3, 10.0  # m or sigmas that lengths of another scale may move p by, with a CHECK
+_NO_ARM = 0.02  # m rms
 _NOT_EXACT = 3.0  # times the corners' noise
 _COARSER = 1.5  # times the stated noise: 20 poses tell it to a fifth
 _ANCHORS = ("park", "horaud", "daniilidis")  # that fail together only where something is wrong
@@ -35,20 +37,30 @@ class Doubts:
     unconfirmed: str = ""  # the setup was taken by what fits, which other poses the other way round would, too
 
 
-def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubts: Doubts, method: str) -> tuple[Reason, ...]:
-    """Return the reasons about `name` = T_1_2, PASS where there is nothing to say; what explains the others comes first."""
-    cause = _cause(fit, doubts)
-    found = (*cause, *([] if cause else _scale(fit)), *_open(fit, not cause), *_poses(fit, wrong), *_about(fit))
+@dataclass(frozen=True)
+class Judged:
+    """What is to be said of X."""
+
+    reasons: tuple[Reason, ...]
+    contradicted: bool  # no X fits these poses: its sigmas say nothing
+
+
+def judge_hand_eye(name: str, fit: HandEyeFit, wrong: tuple[Suspect, ...], doubts: Doubts, method: str) -> Judged:
+    """Return the reasons about `name` = T_1_2, none where there is nothing to say; what explains the others comes first."""
+    pattern = None if fit.lag is not None else pattern_of(fit)  # what a lag leaves looks like any of them
+    cause = _cause(fit, doubts, pattern)
+    misfit = cause or _scale(fit) or ([] if pattern is None else [(pattern.verdict, pattern.text)]) or _too_far(fit)
+    found = (*misfit, *_open(fit, not cause), *_poses(fit, wrong), *_about(fit))
     reasons = [Reason(verdict, f"{name}: {text}") for verdict, text in found]
     chosen = fit.methods.get(method)
     if chosen is not None and chosen.failed:
         reasons.append(Reason(Verdict.FAIL, f"{name}: {method}, which was asked for, is far from the refined X: take --method refined"))
     if doubts.unconfirmed:
         reasons.append(Reason(Verdict.CHECK, f"{name}: {doubts.unconfirmed}"))
-    return tuple(reasons)
+    return Judged(tuple(reasons), any(verdict is Verdict.FAIL for verdict, _ in misfit))
 
 
-def _cause(fit: HandEyeFit, doubts: Doubts) -> list[tuple[Verdict, str]]:
+def _cause(fit: HandEyeFit, doubts: Doubts, pattern: Pattern | None) -> list[tuple[Verdict, str]]:
     """Return what is wrong with all poses alike: then no more of them would help, and no other guess is worth telling."""
     s, motion = doubts.length_ratio, fit.data.setup == "motion"
     if doubts.better:
@@ -59,6 +71,8 @@ def _cause(fit: HandEyeFit, doubts: Doubts) -> list[tuple[Verdict, str]]:
         why = "the units of both sides" if motion else unit_of(s) or "the size of the board and the units of the poses"
         check = "" if unit_of(s) and not motion else "check "
         return [(Verdict.FAIL, f"{_second(fit)}'s lengths times {s:.4g} fit far better: {check}{why}")]
+    if pattern is not None and pattern.moved and pattern.verdict is Verdict.FAIL:
+        return [(pattern.verdict, pattern.text)]
     if places_disagree(fit) and not _scale(fit):
         text = "the angles between poses agree and their places do not: places or angles are read wrongly"
         names = "units and the quaternions' order of both sides" if motion else "--pose-format, --pose-unit and the quaternions' order"
@@ -78,6 +92,15 @@ def _scale(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
     check = "the units of both, and the scale of an odometry" if fit.data.setup == "motion" else ""
     check = check or "the board's squares (measure them), the target file and the units of the poses"
     return [(Verdict.FAIL if far > min(_OFF, _OFF_SIGMAS * sigma) else Verdict.CHECK, f"{text}: check {check}")]
+
+
+def _too_far(fit: HandEyeFit) -> list[tuple[Verdict, str]]:
+    """Return that an arm's poses leave more than any arm and board err by; an odometry that drifts may."""
+    left = float(np.sqrt(np.mean(np.sum(fit.residual[fit.kept, :3] ** 2, axis=1)))) if fit.kept.any() else 0.0
+    if not fit.data.words.arm or left < _NO_ARM:
+        return []
+    text = f"the poses leave {plain(1e3 * left)} mm, more than an arm and a board err by: poses of other moments or read wrongly"
+    return [(Verdict.FAIL, f"{text}; check which pose belongs to which image, --pose-format, --angle-unit")]
 
 
 def _second(fit: HandEyeFit) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from calibkit.data.progress import Progress, silent
 from calibkit.data.result import Result
 from calibkit.data.verdict import Verdict
-from calibkit.errors import BadInputError, NotConvergedError, one_line
+from calibkit.errors import BadInputError, NotConvergedError, NotObservableError, one_line
 from calibkit.estimation.hand_eye import HandEyeFit, Settings, calibrate_hand_eye
 from calibkit.estimation.hand_eye_asked import REFINED, Asked
 from calibkit.estimation.hand_eye_data import HandEyeData, of_motions, of_recording
@@ -19,7 +19,7 @@ from calibkit.estimation.hand_eye_methods import METHODS
 from calibkit.estimation.hand_eye_pixels import corner_rms
 from calibkit.estimation.hand_eye_redrawn import by_closed_form
 from calibkit.estimation.hand_eye_result import hand_eye_result
-from calibkit.estimation.hand_eye_setup import SIGNS, Choice, choose_setup
+from calibkit.estimation.hand_eye_setup import SIGNS, Choice, choose_setup, refuse_copies
 from calibkit.estimation.hand_eye_verdict import Doubts
 from calibkit.estimation.hand_eye_world import WORLD_METHODS
 from calibkit.geometry import se3
@@ -36,20 +36,21 @@ MAX_PREDICTED = 10_000
 def hand_eye(sources: Sequence[Path], outputs: Outputs | None = None, options: Options | None = None, progress: Progress = silent) -> Saved:
     """Estimate X = T_gripper_cam, T_base_cam or T_sensor1_sensor2 from poses of both sides.
 
-    BadInputError names the file, topic or option that is wrong, or that the poses do not tell the setup.
+    BadInputError names the file, topic or option that is wrong, NotObservableError that the poses do not tell the setup.
     """
     outputs, options = outputs or Outputs(), options or Options()
     _check(options)
     base = outputs.open()
     sides = gather(sources, base, options, progress)
     try:
+        refuse_copies(sides.first, sides.second)
         choice = _choice(sides, options)
         seen = corners(sides, base, options)
         fit = sides.fit or calibrate_hand_eye(_problem(sides, choice, options), Settings(robot=robot_noise(options.robot_noise)), seen)
         if options.method != REFINED:
             fit = by_closed_form(fit, options.method)
-    except BadInputError as error:
-        raise BadInputError(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
+    except (BadInputError, NotObservableError) as error:
+        raise type(error)(f"{', '.join(one_line(name, 80) for name, _ in sides.inputs)}: {error}") from None
     step = 0 if options.motions or sides.fit is not None else out_of_step(fit.data)
     told = told_step(step) if step else ""
     doubts = Doubts(choice.better, choice.times, length_ratio(fit), told, choice.unconfirmed or sides.unconfirmed)

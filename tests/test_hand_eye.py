@@ -265,6 +265,31 @@ def test_a_lag_is_named_with_its_size_and_sign(lag: float, drift: bool | None) -
     assert calibrate_hand_eye(data, Settings(methods=False, drift=False)).lag is None
 
 
+@pytest.mark.parametrize("n_seeds", seeds(3))
+@pytest.mark.parametrize("n", [150, 400])
+def test_a_lag_is_in_the_sigmas(n: int, n_seeds: int) -> None:
+    """It moves X and Z by many of their own sigmas; how far counts as one more, so that these are too wide rather than too narrow."""
+    z: dict[str, list[Array]] = {"X": [], "Z": [], "X alone": []}
+    told = 0
+    for s in range(n_seeds):
+        X, data = stream(np.random.default_rng(s), n, 0.0, 0.01)
+        clean_X, clean = stream(np.random.default_rng(s), n, 0.0, 0.0, (0.0, 0.0))
+        fit = calibrate_hand_eye(data, Settings(methods=False, drift=False))
+        assert fit.Z is not None
+        assert fit.cov_Z is not None
+        told += fit.lag is not None
+        Z = clean.P[0] @ clean_X @ se3.inverse(clean.Q[0])
+        z["X"].append(error(fit, X) / np.sqrt(np.diag(fit.cov_X)))
+        z["X alone"].append(error(fit, X) / np.sqrt(np.diag(fit.trusted.cov_X)))
+        z["Z"].append(se3.local(Z, fit.Z) / np.sqrt(np.diag(fit.cov_Z)))
+    rms = {key: float(np.sqrt(np.mean(np.square(values)))) for key, values in z.items()}
+    print(f"{n} poses: told in {told} of {n_seeds}, error over sigma", rms)
+    assert told > 0.9 * n_seeds
+    assert 0.4 < rms["X"] < 1.25
+    assert 0.4 < rms["Z"] < 1.25
+    assert rms["X"] < 0.75 * rms["X alone"]
+
+
 # ---- robust and exact beyond the closed forms
 
 

@@ -100,6 +100,9 @@ def _calibrate(data: HandEyeData, settings: Settings, corners: Corners | None) -
         raise BadInputError(f"hand-eye needs two poses at least and has {len(data.P)}: record 10 or more, turned about two axes or more")
     data = _in_chunks(data, settings)
     found, trusted, lens = _solve(data, settings, corners)
+    late = lag(data, found, trusted.inflation)
+    by_lag = (np.zeros((6, 6)),) * 2 if late is None else (np.outer(late.x, late.x), np.outer(late.z, late.z))
+    cov_X = trusted.cov_X + by_lag[0]
     X, Z = found.X, found.Z
     pairs = pairs_of(data, np.ones(len(data.P), bool))
     good = pairs_of(data, found.kept)
@@ -108,11 +111,11 @@ def _calibrate(data: HandEyeData, settings: Settings, corners: Corners | None) -
     return HandEyeFit(
         data=data,
         X=X,
-        cov_X=trusted.cov_X,
-        plain_cov_X=trusted.plain_X,
+        cov_X=cov_X,
+        plain_cov_X=trusted.plain_X + by_lag[0],
         Z=Z[0] if one else None,
-        cov_Z=trusted.cov_Z if one else None,
-        plain_cov_Z=trusted.plain_Z if one else None,
+        cov_Z=trusted.cov_Z + by_lag[1] if one else None,
+        plain_cov_Z=trusted.plain_Z + by_lag[1] if one else None,
         kept=found.kept,
         residual=se3.local(Z[data.world] @ data.Q, data.P @ X),
         chi2=found.chi2,
@@ -120,13 +123,13 @@ def _calibrate(data: HandEyeData, settings: Settings, corners: Corners | None) -
         pair_angle=angle,
         pair_distance=distance,
         scatter=scatter(data, X, found.kept),
-        methods=methods_of(data, found, trusted.cov_X, good) if settings.methods and len(good) else {},
+        methods=methods_of(data, found, cov_X, good) if settings.methods and len(good) else {},
         noise=found.noise,
         noise_assumed=found.freedom == 0,
         spectrum=spectrum(motions(data.P, good)),
-        open=trusted.open,
+        open=trusted.open if late is None else open_directions(data, X, cov_X),
         advice=trusted.advice,
-        lag=lag(data, found, trusted.inflation),
+        lag=late,
         n_worlds=data.n_worlds,
         converged=found.converged,
         by_reach=found.by_reach,

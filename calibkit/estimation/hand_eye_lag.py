@@ -24,6 +24,8 @@ class Lag:
     dt: float  # s
     sigma: float
     share: float  # of chi-squared that it explains
+    x: Array  # (6,) by how much it moves X, in its right tangent: told and not corrected, it counts as one more sigma
+    z: Array  # (6,) by how much the first Z
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Column:
     tells: Array  # (k,) g^T C^-1 g of the k poses used, g what remains: the information about dt
     pull: Array  # (k,) g^T C^-1 e
     x: Array  # (6,) d x / d dt, in X's right tangent
+    z: Array  # (6,) of the first world
 
     @property
     def whole(self) -> float:
@@ -61,7 +64,7 @@ def eliminated(data: HandEyeData, fit: Refined, g: Array, rows: Mask) -> Column:
     used = rows & system.active
     left = (g + x - (system.J_Z @ z[data.world][:, :, None])[:, :, 0])[used]
     weighed = np.linalg.solve(fit.C[used], left[:, :, None])[:, :, 0]
-    return Column(used, np.sum(weighed * left, axis=1), np.sum(weighed * fit.e[used], axis=1), x)
+    return Column(used, np.sum(weighed * left, axis=1), np.sum(weighed * fit.e[used], axis=1), x, z[0])
 
 
 def lag(data: HandEyeData, fit: Refined, inflation: float) -> Lag | None:
@@ -84,7 +87,8 @@ def lag(data: HandEyeData, fit: Refined, inflation: float) -> Lag | None:
     column = eliminated(data, fit, v, known)
     sigma = float(np.sqrt(inflation / column.whole))
     share = column.dt**2 * column.whole / max(float(np.sum(fit.chi2[column.used])), 1e-300)
-    return Lag(column.dt, sigma, share) if abs(column.dt) > _SIGMAS * sigma else None
+    told = abs(column.dt) > _SIGMAS * sigma
+    return Lag(column.dt, sigma, share, column.dt * column.x, column.dt * column.z) if told else None
 
 
 def stretch(data: HandEyeData, fit: Refined, inflation: float) -> Stretch | None:

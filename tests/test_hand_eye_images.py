@@ -305,6 +305,26 @@ def test_a_free_lens_finds_its_focal_length_and_both_sigmas_are_honest(setup: st
     assert np.sum(np.square(errors)) < np.sum(np.square(held))
 
 
+@pytest.mark.parametrize("n_seeds", seeds(4, 50))
+def test_a_free_lens_holds_what_the_detector_always_errs_by(n_seeds: int) -> None:
+    """A bias of each part of the image that no number of images averages out, told and not."""
+    bias, z = 0.1, {True: [], False: []}
+    for s in range(n_seeds):
+        _, G, views, rng = recorded("eye-in-hand", s, noise_px=0.1)
+        patch = np.clip(views.uv / views.image_size * (4, 3), 0, (3, 2)).astype(int)
+        field = bias * rng.normal(size=(4, 3, 2))
+        views = replace(views, uv=(views.uv + field[patch[:, 0], patch[:, 1]]).astype(views.uv.dtype))
+        for told, off in z.items():
+            fit = solve("eye-in-hand", G, replace(views, sigma_bias_px=bias * told), lens(), free=True)[0]
+            assert fit.lens is not None
+            assert fit.refined.corners is not None
+            off.append((fit.refined.corners.lens - SIM.params) / np.sqrt(np.diag(fit.lens.cov)))
+    with_it, without = (np.sqrt(np.mean(np.square(z[told]))) for told in (True, False))
+    print("error over sigma", with_it, "without the bias", without)
+    assert 0.5 < with_it < 1.5
+    assert without > 1.4 * with_it
+
+
 def with_a_rigs_lens(free: bool, n_seeds: int) -> tuple[list[Array], list[Array]]:
     """Errors and covariances of X where the lens is off by draws of its covariance."""
     cov = np.diag(np.array([1.0, 1.0, 1.0, 1.0, 3e-3, 3e-3, 2e-4, 2e-4]) ** 2)

@@ -8,6 +8,7 @@ of m and d, |r - J m - L d|^2 is a measurement of M_i, and one of the lens,
 Taken anew at each adjusted pose, Q_i makes of pose equations those of the images: corners that tell a pose badly are no Gaussian pose.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from calibkit.data.rig import Camera
 from calibkit.estimation.board_poses import BoardPoses
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews, LensState
 from calibkit.estimation.lens_fit import OUTLIER, dense_views, rows_of
+from calibkit.estimation.lens_trust import biased
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
@@ -48,6 +50,7 @@ class Corners:
     prior: Array  # (p, p) information about it that these images are no part of
     start: Array  # (p,) the lens that it is about
     covariance: Array | None  # (p, p) of a lens that is held, where it is told
+    bias_px: float = 0.0  # what the detector always errs by at one place of the image
 
     def at(self, M: Array) -> Sight:
         """Return what the corners say, linearised at poses M (n, 4, 4)."""
@@ -74,6 +77,13 @@ class Corners:
         """Return the information (p, p) about the lens that is not in the images, and its gradient (p,): the rig's and the model's own."""
         _, C, g = CameraProblem(self.points, (self.grid,)).prior((self.lens,))
         return self.prior + C, self.prior @ (self.start - self.lens) + g
+
+    def biased(self, M: Array) -> Iterator["Corners"]:
+        """Yield the corners as poses M (n, 4, 4) predict them, then the same with one patch of the image biased, patch by patch."""
+        whole = replace(self.grid, weight=np.ones_like(self.grid.weight))
+        predicted = self.grid.uv - CameraProblem(self.points, (whole,)).residuals(self._state(M), 0).px
+        for uv in (predicted, *biased(predicted, self.grid.image_size, self.bias_px)):
+            yield replace(self, grid=replace(self.grid, uv=uv))
 
     def without_outliers(self, M: Array) -> "Corners":
         """Return the corners with those given up that lie beyond 4.5 sigmas of their view at poses M; the others get their weight back."""
@@ -113,7 +123,7 @@ def corners_of(views: BoardViews, poses: BoardPoses, camera: Camera, free: bool 
     prior = np.zeros((len(lens), len(lens)))
     if covariance is not None and not same_images:
         prior = np.asarray(np.linalg.pinv(covariance, hermitian=True, rcond=1e-15), np.float64)
-    corners = Corners(views.board.points, grid, found[poses.frame], lens, free, prior, lens, covariance)
+    corners = Corners(views.board.points, grid, found[poses.frame], lens, free, prior, lens, covariance, views.sigma_bias_px)
     M = se3.inverse(poses.T_cam_board)
     # The poses' covariance is that of the view's noise: sigma^2 A^-1, as here but for sigma.
     Ad = se3.adjoint(poses.T_cam_board)

@@ -7,6 +7,7 @@ import numpy as np
 from calibkit.estimation.hand_eye_data import HandEyeData, Mask
 from calibkit.estimation.hand_eye_images import Corners, Sight
 from calibkit.estimation.hand_eye_normal import SCALES, Normal
+from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.solver import trust
 
@@ -83,4 +84,22 @@ def lens_effect(
     prior[-p:, -p:] = corners.lens_prior()[0]
     units = np.concatenate([np.ones(k + 6), 1 / np.sqrt(np.diag(step.information))])
     found = trust.covariance(S, scores, 1.0, units, prior, least=min(1.0, trust.FEW_BLOCKS / len(S)))
-    return LensEffect(found.corrected[-p:, -p:], found.plain[-p:, -p:], step.X, step.Z)
+    bias = _bias_covariance(data, system, M, C, kept, corners, variance)
+    return LensEffect(found.corrected[-p:, -p:] + bias, found.plain[-p:, -p:], step.X, step.Z)
+
+
+def _bias_covariance(data: HandEyeData, system: Normal, M: Array, C: Array, kept: Mask, corners: Corners, variance: float) -> Array:
+    """Return what the detector's own bias does to a free lens (p, p): sum over patches of d d^T, d its step when a patch's corners shift.
+
+    No number of images averages it out: see lens_trust. X follows the lens; what it does to the poses themselves is far below their noise.
+    """
+    total = np.zeros((len(corners.lens),) * 2)
+    if not corners.bias_px:
+        return total
+    steps = []
+    for moved in corners.biased(M):
+        sight = moved.at(M)
+        left = system.respond(data, M, C, -se3.local(M, sight.Q), kept)[2]
+        steps.append(lens_step(data, system, M, C, left, kept, moved, sight, variance).d)
+    d = np.array(steps[1:]) - steps[0]  # without the prior's own pull
+    return np.asarray(d.T @ d)

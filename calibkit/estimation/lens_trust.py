@@ -1,5 +1,6 @@
 """How far fitted lenses and camera positions may be trusted: covariance, what the views can tell, projection uncertainty."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -51,17 +52,23 @@ def _bias_covariance(fit: LensFit) -> Array:
     inverse = np.linalg.pinv(S.sum(axis=0) + problem.prior(state.lenses)[1] * np.mean(some), rcond=1e-14, hermitian=True)
     for c, (views, camera) in enumerate(zip(fit.views, problem.cameras, strict=True)):
         predicted = camera.uv - problem.residuals(state, c).px
-        patch = np.clip(predicted / camera.image_size * _BIAS_PATCHES, 0, np.array(_BIAS_PATCHES) - 1).astype(int)
-        patch_number = patch[..., 0] + _BIAS_PATCHES[0] * patch[..., 1]
         silent = tuple(replace(other, uv=other.uv - problem.residuals(state, k).px) for k, other in enumerate(problem.cameras))
-        for number, axis in product(range(_BIAS_PATCHES[0] * _BIAS_PATCHES[1]), range(2)):
-            uv = predicted.copy()
-            uv[..., axis] += np.where(patch_number == number, views.sigma_bias_px, 0.0)
+        for uv in biased(predicted, camera.image_size, views.sigma_bias_px):
             cameras = (*silent[:c], replace(camera, uv=uv), *silent[c + 1 :])
             _, scores = replace(problem, cameras=cameras).information(state)
             shift = inverse @ scores.sum(axis=0)
             total += np.outer(shift, shift)
     return total
+
+
+def biased(predicted: Array, image_size: tuple[int, int], sigma_px: float) -> Iterator[Array]:
+    """Yield the corners (..., 2) with those of one patch of the image moved in x or y by one sigma of the detector's bias."""
+    patch = np.clip(predicted / image_size * _BIAS_PATCHES, 0, np.array(_BIAS_PATCHES) - 1).astype(int)
+    patch_number = patch[..., 0] + _BIAS_PATCHES[0] * patch[..., 1]
+    for number, axis in product(range(_BIAS_PATCHES[0] * _BIAS_PATCHES[1]), range(2)):
+        uv = predicted.copy()
+        uv[..., axis] += np.where(patch_number == number, sigma_px, 0.0)
+        yield uv
 
 
 def border_scales(problem: CameraProblem, lenses: tuple[Array, ...]) -> Array:

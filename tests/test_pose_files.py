@@ -1,6 +1,7 @@
 """Pose files: each convention against scipy's rotations, each refusal by its line, names to images, and bytes that are wrong."""
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,23 @@ def test_image_names_stand_first_or_last(tmp_path: Path) -> None:
         check(table)
         assert table.labels == tuple(names)
         assert table.named(2) == "im_02.png"
+
+
+@pytest.mark.parametrize("pattern", ["im[0{}].png", "[{}].jpg", "im*?{}.png", "cam[0][{}]"])
+def test_brackets_and_other_signs_of_a_name_are_its_own(tmp_path: Path, pattern: str) -> None:
+    names = [pattern.format(i) for i in range(N)]
+    for mark in (",", " "):
+        table = load_poses(write(tmp_path, rows(WRITTEN["ros"], mark, names)), "ros")
+        check(table)
+        assert table.labels == tuple(names)
+    assert match_images(table, names[::-1]).pose.tolist() == list(range(N))
+
+
+def test_brackets_take_no_time(tmp_path: Path) -> None:
+    start = time.thread_time()
+    for line in ("[" * 8000, "[a]" * 2700, "a" * 8000 + "[", "a[" * 4000):
+        refused(lambda line=line: load_poses(write(tmp_path, f"{line}\n"), "ros"))
+    assert time.thread_time() - start < 1.0
 
 
 def test_a_counter_in_front_is_no_number_of_the_pose(tmp_path: Path) -> None:

@@ -12,7 +12,9 @@ from calibkit.io.pose_names import ROTATIONS, Array, PoseRows, name_of
 from calibkit.io.text_table import XYZ
 
 _COMMENT = re.compile(r"\s*(#|%|//)+")
-_BRACKETS = re.compile(r"\bp?\[|\[|\]")  # numpy's, and p[...] of UR's scripts
+_PART = r"[^\s,;\[\]]"  # of a word
+# A name that has some, im[01].jpg or [1].png; and numpy's, p[...] of UR's scripts.
+_BRACKETS = re.compile(rf"(?<![^\s,;\[])({_PART}+(?:\[{_PART}*\])+{_PART}*|(?:\[{_PART}*\])+{_PART}+)|\bp?\[|\[|\]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _MAX_LINE = 8192  # characters
 _MAX_ROWS = 500_000
@@ -78,7 +80,7 @@ def _table(path: Path, text: str) -> _Table:
             if comment and not table.rows:
                 table.titles.append(_Line(0, _titles(content[comment.end() :])))
             continue
-        fields = _fields(path, line, _BRACKETS.sub(" ", content) if "]" in content or "[" in content else content)
+        fields = _fields(path, line, _BRACKETS.sub(lambda found: found[1] or " ", content))
         if not fields:  # brackets only
             continue
         if all(number(value) is None for value in fields):

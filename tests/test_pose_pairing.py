@@ -27,6 +27,7 @@ from calibkit.estimation.pose_interpolation import (
     stream_of_board,
     without_repeats,
 )
+from calibkit.estimation.pose_jumps import jumps
 from calibkit.estimation.pose_offset import ClockOffset, Settings, aligned
 from calibkit.estimation.pose_pairing import Pairing, pair_poses
 from calibkit.geometry import se3, so3
@@ -280,6 +281,20 @@ def test_an_offset_from_turns_of_which_half_are_wrong_is_right_or_refused() -> N
             told.append(aligned(P, Q, Settings()).offset)
     print(f"told in {len(told)} of 20")
     assert all(abs(offset.dt - 0.05) < 4 * offset.sigma for offset in told)
+
+
+def test_poses_that_jump_and_come_back_do_not_hide_the_offset() -> None:
+    """A tracker that loses its target for single poses; of streams without such none is taken for one."""
+    for seed in range(3):
+        P, Q = moving(seed, 3.2, wrong=0.3)
+        assert np.mean(jumps(P)) == 0
+        assert np.mean(jumps(moving(seed, 3.2)[1])) == 0
+        both = aligned(P, Q, Settings())
+        assert abs(both.offset.dt - 3.2) < 4 * both.offset.sigma
+        assert re.search("(2.|30|31)% of cam's poses jump away .*: the clocks are aligned without them", both.lines[0])
+    lost, whole = moving(0, 3.2, wrong=0.45)[1], moving(1, 3.2)[0]  # of another body
+    with pytest.raises(BadInputError, match=r"% of cam's poses jump away .*: remove these, or give dt_robot_cam in a rig file"):
+        aligned(whole, lost, Settings())
 
 
 def test_the_slower_stream_may_be_either_and_the_offset_keeps_its_sign() -> None:

@@ -9,6 +9,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Status
 from calibkit.errors import BadInputError
 from calibkit.estimation.pose_interpolation import PoseStream, in_time, without_repeats
+from calibkit.estimation.pose_jumps import jumps
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
@@ -18,6 +19,7 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 MOST_PAIRS = 1000
+_JUMPS = 0.01  # of the poses, from which on they are told of
 _COARSE_S = 0.02  # an offset that turns tell so well is a start: whole poses tell it better
 
 
@@ -114,25 +116,45 @@ def offset_by_turns(
 ) -> tuple[ClockOffset, list[str], tuple[Reason, ...]]:
     """Return the offset, what is to be said of it, and its verdict's reasons; a weak one is none: its sigma goes into what follows.
 
+    Poses that jump away from their neighbours and back are left out: one in 300 has made an offset seconds off.
     BadInputError where the streams do not tell it and have clocks of their own.
     """
     P, Q = (fast, slow) if read_P else (slow, fast)
-    name = f"dt_{fast.name}_{slow.name}"
+    wrong = [jumps(each) for each in (slow, fast)]
+    many = [f"{np.mean(w):.0%} of {each.name}'s" for each, w in zip((slow, fast), wrong, strict=True) if np.mean(w) > _JUMPS]
+    said = f"{' and '.join(many)} poses jump away from their neighbours and back, as where a tracker loses its target" if many else ""
+    told = _told_by(slow.select(~wrong[0]), fast.select(~wrong[1]), read_P, progress)
+    if told.offset is not None:
+        return told.offset, [f"{said}: the clocks are aligned without them"] if said else [], told.reasons
+    if not one_clock:
+        remedy = f"give dt_{fast.name}_{slow.name} in a rig file"
+        why = f"{said}: remove these, or {remedy} ({told.why})" if said else f"{told.why}; or {remedy}"
+        raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}")
+    return ClockOffset(0.0, 0.0, "assumed"), [f"the poses do not tell the offset of {P.name} and {Q.name}: {told.why}"], told.reasons
+
+
+@dataclass(frozen=True)
+class _Told:
+    """The offset by turns, or why there is none."""
+
+    offset: ClockOffset | None
+    why: str
     reasons: tuple[Reason, ...] = ()
+
+
+def _told_by(slow: PoseStream, fast: PoseStream, read_P: bool, progress: Progress) -> _Told:
+    P, Q = (fast, slow) if read_P else (slow, fast)
+    name = f"dt_{fast.name}_{slow.name}"
     try:
         fit = _fit(slow, fast, progress)
     except BadInputError as error:
-        why = str(error)
-    else:
-        judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns, "pose") for each in (P, Q)})
-        if judged.status is not Status.NOT_OBSERVABLE or (judged.coarse and fit.sigma < _COARSE_S):
-            offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit, judged.fast)
-            return offset, [], tuple(reason for reason in judged.reasons if reason is not judged.size)
-        assert judged.size is not None
-        why, reasons = judged.size.text.removeprefix(f"{name}: not observable: "), judged.others
-    if not one_clock:
-        raise BadInputError(f"{P.name} and {Q.name}: the offset of their clocks is not known: {why}; or give {name} in a rig file")
-    return ClockOffset(0.0, 0.0, "assumed"), [f"the poses do not tell the offset of {P.name} and {Q.name}: {why}"], reasons
+        return _Told(None, str(error))
+    judged = judge_time_offset(name, slow.name, fast.name, fit, {each.name: check_stamps(each.t_ns, "pose") for each in (P, Q)})
+    if judged.status is not Status.NOT_OBSERVABLE or (judged.coarse and fit.sigma < _COARSE_S):
+        offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit, judged.fast)
+        return _Told(offset, "", tuple(reason for reason in judged.reasons if reason is not judged.size))
+    assert judged.size is not None
+    return _Told(None, judged.size.text.removeprefix(f"{name}: not observable: "), judged.others)
 
 
 def _fit(slow: PoseStream, fast: PoseStream, progress: Progress) -> TimeOffsetFit:

@@ -27,6 +27,7 @@ from calibkit.stages import calibrate
 from calibkit.stages.convert import export_rig
 
 SAMPLES = Path(__file__).parent.parent / "sample_bags"
+README = Path(__file__).parent.parent / "README.md"
 TD = 0.025
 STAGES = ["intrinsics", "timeoffset", "joint"]
 NO_WALKS = "imu0 has no random walks in the rig file"
@@ -123,12 +124,22 @@ def test_from_a_recording_to_a_rig_file_and_one_report(
 
 
 @pytest.mark.slow
-def test_the_sample_bag(run: Run, tmp_path: Path) -> None:
-    """One command from a clone to a rig file, pictures and all."""
-    out = tmp_path / "rig.yaml"
-    said = run(SAMPLES / "cam_imu.bag", "--target", SAMPLES / "target.yaml", "-o", out, "--report", tmp_path / "report")
+def test_the_sample_bag_says_what_the_readme_says(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One command from a clone to a rig file, pictures and all. Digits may differ by the version of OpenCV, words may not."""
+    section = README.read_text(encoding="utf-8").split("## Your camera and IMU")[1].split("\n## ")[0]
+    command, *shown = [line.strip() for line in section.splitlines() if line.startswith("    ")]
+    (tmp_path / "out").mkdir()
+    (tmp_path / "sample_bags").symlink_to(SAMPLES)
+    monkeypatch.chdir(tmp_path)
+    said = run(*command.split()[2:])
     assert said.code == 0, said
-    rig, truth = load_rig(out), load_rig(SAMPLES / "truth.yaml")
+
+    def words(text: str) -> str:
+        return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?| +", " ", text).replace("  ", " ").strip()
+
+    printed = {words(line) for line in said.out.splitlines()}
+    assert [line for line in shown if words(line) not in printed and not line.startswith("calibkit intrinsics")] == []
+    rig, truth = load_rig(tmp_path / "out" / "rig.yaml"), load_rig(SAMPLES / "truth.yaml")
     found, true = (find_transform(each, "imu0", "cam0") for each in (rig, truth))
     assert found is not None
     assert true is not None
@@ -136,7 +147,7 @@ def test_the_sample_bag(run: Run, tmp_path: Path) -> None:
     assert np.all(off[:3] < 2e-3)
     assert np.all(off[3:] < 3e-4)
     assert abs((rig.time_offsets["dt_imu0_cam0"].offset.value or 0) - 0.005) < 6e-5
-    assert len(list((tmp_path / "report").glob("*.png"))) > 15
+    assert len(list((tmp_path / "out" / "report").glob("*.png"))) > 15
 
 
 @pytest.mark.usefixtures("undrawn")

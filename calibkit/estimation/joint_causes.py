@@ -16,6 +16,7 @@ from calibkit.geometry.spline import Steps, basis, turning
 
 WORDS = {"gyro": "gyroscope", "accel": "accelerometer"}
 _UNITS = {"gyro": {"deg/s": 180 / np.pi}, "accel": {"g": 1 / 9.80665, "mg": 1000 / 9.80665}}  # what a reading in it is over one in SI
+_NOISY = 3.0  # real over stated sigma
 _EXPLAINED = 0.8  # of what a sensor reads must come from the others' motion by one matrix
 _OTHER_UNIT = 0.15  # of a scale's logarithm
 _TURNED = np.radians(10.0)
@@ -29,23 +30,48 @@ class Read:
     M: Array  # (3, 3)
     explained: float
 
+    @property
+    def orthogonal(self) -> Array:
+        """Return the orthogonal matrix next to M: a rotation, or one with a mirror."""
+        U, _, Vt = np.linalg.svd(self.M)
+        out: Array = U @ Vt
+        return out
 
-def wrong_axes(joint: Joint, kind: str, imu: str) -> str:
-    """Name swapped or flipped axes, or another unit, of the gyroscope or the accelerometer; "" where it is neither."""
-    read = _READINGS[kind](joint.fit.problem, joint.fit.x)
-    if read.explained < _EXPLAINED:
-        return ""
-    U, s, Vt = np.linalg.svd(read.M)
-    size = float(np.exp(np.mean(np.log(np.maximum(s, 1e-300)))))
-    name = f"{imu}'s {WORDS[kind]}"
+
+def wrong_sensors(joint: Joint, imu: str) -> dict[str, str]:
+    """Name, by kind, another unit or swapped or flipped axes of gyroscope and accelerometer, where their residuals ask for it."""
+    asked = [kind for kind in WORDS if joint.fit.factors[kind] > _NOISY]
+    if not asked:
+        return {}
+    found = {kind: reading(joint.fit.problem, joint.fit.x) for kind, reading in _READINGS.items()}
+    told = {kind: read for kind, read in found.items() if read.explained > _EXPLAINED}
+    out = {kind: text for kind in asked if kind in told and (text := _unit(kind, told[kind], imu))}
+    if out:
+        return out
+    axes = {kind: read.orthogonal for kind, read in told.items()}
+    mirrored = [kind for kind, Q in axes.items() if np.linalg.det(Q) < 0]
+    if mirrored:  # what the other shows is that the rig's axes followed the mirrored one
+        return {kind: _wrong(kind, Q @ _other(axes, kind).T, imu) for kind, Q in axes.items() if kind in mirrored}
+    return {kind: _wrong(kind, axes[kind], imu) for kind in asked if kind in axes and np.linalg.norm(so3.log(axes[kind])) > _TURNED}
+
+
+def _unit(kind: str, read: Read, imu: str) -> str:
+    size = float(np.exp(np.mean(np.log(np.maximum(np.linalg.svd(read.M, compute_uv=False), 1e-300)))))
     unit = next((unit for unit, worth in _UNITS[kind].items() if abs(np.log(size / worth)) < _OTHER_UNIT), None)
-    if unit is not None:
-        return f"{name} reads {size:.3g} times what the others have it turn and accelerate: is it in {unit}? then add --{kind}-unit {unit}"
-    Q = U @ Vt
-    if np.linalg.det(Q) < 0 or np.linalg.norm(so3.log(Q)) > _TURNED:
-        hand = "they are no right-handed frame; " if np.linalg.det(Q) < 0 else ""
-        return f"{name} has its axes wrong: its x, y, z are the rig's {_axes(Q)} by all other data; {hand}mend the driver"
-    return ""
+    name = f"{imu}'s {WORDS[kind]}"
+    return (
+        "" if unit is None else f"{name} reads {size:.3g} times what all other data have it: is it in {unit}? then add --{kind}-unit {unit}"
+    )
+
+
+def _other(axes: dict[str, Array], kind: str) -> Array:
+    """Return the other sensor's axes, the identity where they are not told or mirrored, too."""
+    return next((Q for other, Q in axes.items() if other != kind and np.linalg.det(Q) > 0), np.eye(3))
+
+
+def _wrong(kind: str, Q: Array, imu: str) -> str:
+    hand = "; they are no right-handed frame" if np.linalg.det(Q) < 0 else ""
+    return f"{imu}'s {WORDS[kind]} has its axes wrong: its x, y, z are the rig's {_axes(Q)} by all other data{hand}: mend the driver"
 
 
 def _axes(Q: Array) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.estimation.joint import Joint
-from calibkit.estimation.joint_causes import WORDS, jittering, wrong_axes
+from calibkit.estimation.joint_causes import WORDS, jittering, wrong_sensors
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_seed import STAMPS
 from calibkit.estimation.joint_trust import Trust
@@ -24,7 +24,7 @@ _GRAVITY_OFF = 4.0  # sigmas of what was told
 _SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
 _HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
 _MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
-_OTHER_CLOCK_S = 1.0
+_OTHER_CLOCK_S, _GAP_S = 1.0, 0.9
 
 
 @dataclass(frozen=True)
@@ -138,14 +138,18 @@ def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool) -> tuple[Reaso
     found = []
     if not fit.converged:
         found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
-    wrong = {kind: wrong_axes(joint, kind, imu) if fit.factors[kind] > _NOISIER[kind][0] else "" for kind in WORDS}
-    for i, kind in enumerate(WORDS):
-        if wrong[kind]:
-            found.insert(0, Reason(Verdict.FAIL, wrong[kind]))
-        elif not jitter:
-            found += _of_samples(joint, i, kind, imu)
-    if not wrong["accel"]:
+    wrong = wrong_sensors(joint, imu)
+    if wrong:
+        found = [Reason(Verdict.FAIL, text) for text in wrong.values()]
+    else:
+        found += [reason for i, kind in enumerate(WORDS) if not jitter for reason in _of_samples(joint, i, kind, imu)]
         found += _of_scale(joint, checks, imu)
+    gap = np.diff(fit.problem.imu.t)
+    if gap.max() > _GAP_S:
+        at = fit.problem.imu.t[int(np.argmax(gap))]
+        many = counted(int(np.sum(gap > _GAP_S)), "gap")
+        text = f"{imu} has {many} of up to {gap.max():.2g} s, the longest {at:.4g} s in: images alone hold the trajectory there"
+        found.append(Reason(Verdict.CHECK, text))
     if not np.all(joint.walks_told):
         text = f"{imu} has no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
         found.append(Reason(Verdict.CHECK, text))

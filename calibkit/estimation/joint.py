@@ -121,7 +121,7 @@ def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise,
     start, grids, used = None, [], []
     for each, pose, at, seed in zip(cameras, poses, times, seeds, strict=True):
         inner = (at + seed.td > low + _MARGIN_S) & (at + seed.td < high - _MARGIN_S)
-        grids.append(Frames(at[inner], _grid(each, pose.frame[inner])))
+        grids.append(Frames(at[inner], _grid(each, pose.frame[inner]), each.views.sigma_bias_px))
         used.append(pose.frame[inner])
         order = np.flatnonzero(inner)[np.argsort(at[inner], kind="stable")]
         posed = Posed(at[order], pose.T_cam_board[order], _lens(each.camera))

@@ -7,7 +7,7 @@ from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
-from calibkit.estimation.joint_problem import Frames, JointProblem
+from calibkit.estimation.joint_problem import JointProblem
 from calibkit.estimation.joint_state import SCALE, JointState
 from calibkit.estimation.joint_trust import border_scales, joint_covariance
 from calibkit.estimation.lens_fit import rows_of
@@ -118,7 +118,7 @@ def part_of(problem: JointProblem, x: JointState, segments: slice) -> tuple[Join
     cameras = []
     for frames, camera in zip(problem.cameras, x.cameras, strict=True):
         inside = (frames.t + camera.dt >= knots.start) & (frames.t + camera.dt < end)
-        cameras.append(Frames(frames.t[inside], rows_of(frames.views, inside)))
+        cameras.append(replace(frames, t=frames.t[inside], views=rows_of(frames.views, inside)))
     imu = replace(imu, t=imu.t[rows], gyro=imu.gyro[rows], accel=imu.accel[rows], keep=imu.keep[rows])
     controls = slice(segments.start, segments.stop + whole.order - 1)
     state = replace(x, R=x.R[controls], p=x.p[controls], bias=x.bias[controls])

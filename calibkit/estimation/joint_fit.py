@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.joint_noise import DRAWS, Component, Drawn, components, draw
-from calibkit.estimation.joint_problem import Frames, JointProblem
+from calibkit.estimation.joint_problem import JointProblem
 from calibkit.estimation.joint_state import JointState
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
@@ -112,7 +112,7 @@ def _rescaled(problem: JointProblem, scales: dict[str, float], factors: dict[str
         factors[kind] = factors.get(kind, 1.0) * scale
     sigma = problem.imu.sigma * np.repeat([scales["gyro"], scales["accel"]], 3)
     cameras = tuple(
-        Frames(frames.t, replace(frames.views, weight=frames.views.weight / scales[f"camera {c}"]))
+        replace(frames, views=replace(frames.views, weight=frames.views.weight / scales[f"camera {c}"]))
         for c, frames in enumerate(problem.cameras)
     )
     return replace(problem, imu=replace(problem.imu, sigma=sigma), cameras=cameras)
@@ -126,5 +126,5 @@ def _without_outliers(problem: JointProblem, x: JointState, found: Sequence[Arra
     for c, (frames, weight) in enumerate(zip(problem.cameras, found, strict=True)):
         px, valid = corner_residuals(problem, x, c)
         fits = valid & (np.linalg.norm(px, axis=-1) * weight <= _OUTLIER_CORNER * factors[f"camera {c}"])
-        cameras.append(Frames(frames.t, replace(frames.views, weight=np.where(fits, frames.views.weight, 0.0))))
+        cameras.append(replace(frames, views=replace(frames.views, weight=np.where(fits, frames.views.weight, 0.0))))
     return replace(problem, imu=replace(problem.imu, keep=keep), cameras=tuple(cameras))

@@ -47,6 +47,7 @@ class Frames:
 
     t: Array  # (f,) s on the camera's clock
     views: CameraViews  # `instant` is not used
+    bias_px: float = 0.0  # what the detector always errs by at one place of the image
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class JointProblem:
             for pair in pool.map(lambda rows: self._imu(x, steps, rows), chunks):
                 yield from pair
         for c in range(len(self.cameras)):
-            yield from self._frames(x, steps, c)
+            yield from self.frame_parts(x, steps, c)
         yield self._walk(x)
         yield self._stays(x, steps)
 
@@ -190,7 +191,8 @@ class JointProblem:
         touch, cost = np.arange(where.start, where.stop), float(np.sum(loss[keep]))
         return Part(kind, self.knots.middle(segment), segment, offsets, touch, N, cost, 3 * int(keep.sum()))
 
-    def _frames(self, x: JointState, steps: Steps, c: int) -> Iterator[Part]:
+    def frame_parts(self, x: JointState, steps: Steps, c: int) -> Iterator[Part]:
+        """Yield what camera c's corners say."""
         frames, camera, k = self.cameras[c], x.cameras[c], self.knots.order
         i, u = self.knots.locate(frames.t + camera.dt)
         value, rate = basis(self.knots, u), basis(self.knots, u, 1)

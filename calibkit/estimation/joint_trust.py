@@ -1,21 +1,24 @@
 """How far the joint estimate may be trusted: its covariance with correlated residuals paid for, less what noise alone pretends."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibkit.estimation.joint_fit import JointFit
+from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import schur
 from calibkit.estimation.joint_parts import projected
 from calibkit.estimation.joint_state import LINE, LINE_SCALE
-from calibkit.estimation.lens_trust import lens_scales
+from calibkit.estimation.lens_fit import rows_of
+from calibkit.estimation.lens_trust import biased, lens_scales
 from calibkit.estimation.open_directions import TRANSFORM_SCALES
 from calibkit.geometry.so3 import Array
+from calibkit.geometry.spline import Steps
 from calibkit.solver.banded import Banded
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _GRAVITY_SCALE = 0.01  # m/s^2: 1 mrad of its direction
+_BIAS_FRAMES = 40
 _KNOWN_AT_LEAST = 1e-3  # of a direction's information is not noise's: one draw of it does not tell less from none
 
 
@@ -37,6 +40,7 @@ def joint_trust(fit: JointFit) -> Trust:
 
 def _trust(fit: JointFit, scales: Array) -> Trust:
     covariance = joint_covariance(fit, scales)
+    covariance = replace(covariance, corrected=covariance.corrected + bias_covariance(fit, scales))
     values, vectors = np.linalg.eigh(fit.drawn.S * scales[:, None] * scales)
     root = scales[:, None] * vectors / np.sqrt(np.maximum(values, values[-1] * 1e-15))  # F F^T = S^-1
     share, directions = np.linalg.eigh(root.T @ noise_information(fit) @ root)
@@ -58,6 +62,32 @@ def joint_covariance(fit: JointFit, scales: Array) -> Covariance:
     together = np.concatenate(S)
     prior = fit.drawn.S - together.sum(axis=0)
     return covariance_in_time(together, np.concatenate(scores), np.concatenate(t), 1.0, scales, prior)
+
+
+def bias_covariance(fit: JointFit, scales: Array) -> Array:
+    """Return what the detectors' own bias does to the border (p, p): sum over patches of d d^T, d its step when a patch's corners shift.
+
+    No number of frames averages it out (`lens_trust`), so it is worked out on some of them.
+    """
+    total = np.zeros_like(fit.drawn.S)
+    root = scales[:, None] * scales
+    inverse = root * np.linalg.pinv(fit.drawn.S * root, rcond=1e-14, hermitian=True)
+    steps = Steps.of(fit.x.R)
+    for c, frames in enumerate(fit.problem.cameras):
+        if not frames.bias_px:
+            continue
+        some = np.unique(np.linspace(0, len(frames.t) - 1, _BIAS_FRAMES).astype(int))
+        part = replace(frames, t=frames.t[some], views=rows_of(frames.views, some))
+        cameras = fit.problem.cameras
+        sample = replace(fit.problem, cameras=(*cameras[:c], part, *cameras[c + 1 :]))
+        predicted = part.views.uv - corner_residuals(sample, fit.x, c)[0]
+        for uv in biased(predicted, part.views.image_size, part.bias_px):
+            shifted = replace(part, views=replace(part.views, uv=uv))
+            parts = replace(sample, cameras=(*cameras[:c], shifted, *cameras[c + 1 :])).frame_parts(fit.x, steps, c)
+            scores = sum(projected(each, fit.drawn.core_answer)[1].sum(axis=0) for each in parts)
+            step = inverse @ np.asarray(scores) * (len(frames.t) / len(some))
+            total += np.outer(step, step)
+    return total
 
 
 def noise_information(fit: JointFit, seed: int = 1) -> Array:

@@ -90,14 +90,14 @@ def check(motion: str, seed: int) -> None:
     MOTIONS[motion](recording, joint, result)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_a_motion_leaves_open_is_named(motion: str, seed: int) -> None:
     check(motion, seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 20))
+@pytest.mark.parametrize("seed", range(1, 20))
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_a_motion_leaves_open_is_named_over_many_seeds(motion: str, seed: int) -> None:
     check(motion, seed)
@@ -110,12 +110,12 @@ def no_alarm(seed: int) -> None:
     assert result.exit_code == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_rich_motion_raises_no_alarm(seed: int) -> None:
     no_alarm(seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 100))
+@pytest.mark.parametrize("seed", range(1, 100))
 def test_rich_motion_raises_no_alarm_over_many_seeds(seed: int) -> None:
     no_alarm(seed)

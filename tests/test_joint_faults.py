@@ -1,6 +1,7 @@
 """Faulty recordings: each is survived, right within 3 sigma, or named with its cause and a code other than 0; never wrong with code 0."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -76,7 +77,7 @@ SURVIVED: dict[str, tuple[Callable[[int], Recording], tuple[str, ...]]] = {
 NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
     "10 ms of jitter": (fault("image-jitter"), "cam0: its stamps jitter by"),
     "accelerometer in g": (fault("accel-in-g"), "imu0's accelerometer reads 0.1"),
-    "board a tenth too small": (fault("board-size"), "the board seems 1."),
+    "board a tenth too small": (fault("board-size"), r"the board seems 1\.(09|10)"),
     "tag spacing": (fault("tag-spacing"), "the board seems"),
     "gyroscope's axes swapped": (changed(partial(gyro, M=SWAP)), "imu0's gyroscope has its axes wrong: its x, y, z are the rig's y, x, z"),
     "gyroscope's axis flipped": (changed(partial(gyro, M=FLIP)), "imu0's gyroscope has its axes wrong: its x, y, z are the rig's x, y, -z"),
@@ -88,6 +89,15 @@ NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
         changed(partial(accel, M=FLIP)),
         "imu0's accelerometer has its axes wrong: its x, y, z are the rig's x, y, -z",
     ),
+}
+ALIKE = {
+    "half a second late",
+    "an hour late",
+    "4 Hz",
+    "2 ms of jitter",
+    "lost frames",
+    "gyroscope's axis flipped",
+    "accelerometer's axes swapped",
 }
 REFUSED: dict[str, tuple[Callable[[int], Recording], str]] = {
     "gyroscope in deg/s": (fault("gyro-in-deg"), "--gyro-unit deg/s"),
@@ -101,7 +111,7 @@ def fitted(recording: Recording) -> tuple[Joint, Result]:
     return joint, recording.result(joint)
 
 
-def survives(name: str, seed: int) -> None:
+def survives(name: str, seed: int, sigmas: float = 3.0) -> None:
     make, words = SURVIVED[name]
     recording = make(seed)
     joint, result = fitted(recording)
@@ -109,7 +119,7 @@ def survives(name: str, seed: int) -> None:
     T_dt = slice(where.start, where.start + 7)
     z = error_of(recording, joint)[T_dt] / np.sqrt(np.diag(joint_trust(joint.fit).cov))[T_dt]
     texts = [reason.text for reason in result.reasons]
-    assert np.abs(z).max() < 3.5, (z.round(2), texts)  # the greatest of seven
+    assert np.abs(z).max() < sigmas, (z.round(2), texts)
     assert result.verdict is not Verdict.FAIL, texts
     assert all(any(word in text for text in texts) for word in words), texts
     assert all(any(word in text for word in words) for text in texts), texts
@@ -120,15 +130,20 @@ def names(name: str, seed: int) -> None:
     _, result = fitted(make(seed))
     assert result.exit_code != 0
     fails = [reason.text for reason in result.reasons if reason.verdict is Verdict.FAIL]
-    assert fails[0].startswith(cause), fails
+    assert re.match(cause, fails[0]), fails
 
 
-@pytest.mark.parametrize("name", SURVIVED)
+def some(names: Iterable[str]) -> list[object]:
+    """Return all faults, those that have a like among the others for the slow run."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in ALIKE else name for name in names]
+
+
+@pytest.mark.parametrize("name", some(SURVIVED))
 def test_a_fault_is_survived(name: str) -> None:
     survives(name, 0)
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", some(NAMED))
 def test_a_fault_is_named(name: str) -> None:
     names(name, 0)
 
@@ -144,4 +159,7 @@ def test_a_fault_is_refused(name: str) -> None:
 @pytest.mark.parametrize("seed", range(1, 10))
 @pytest.mark.parametrize("name", [*SURVIVED, *NAMED])
 def test_faults_over_many_seeds(name: str, seed: int) -> None:
-    (survives if name in SURVIVED else names)(name, seed)
+    if name in SURVIVED:
+        survives(name, seed, 3.7)  # the greatest of 7 numbers in 117 recordings: beyond by chance in one run of six
+    else:
+        names(name, seed)

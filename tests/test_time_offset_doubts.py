@@ -28,6 +28,7 @@ from calibkit.data.observations import ImuSamples, PoseSamples
 from calibkit.data.verdict import Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.estimation.alignment_axes import open_axes
+from calibkit.estimation.pose_jumps import without_jumps
 from calibkit.estimation.slow_turns import joined_up, turns_in_long_one
 from calibkit.estimation.turns import Turns, turns_of_poses
 from calibkit.geometry import so3
@@ -239,3 +240,35 @@ def test_a_reference_that_comes_rarely_is_doubted() -> None:
     reference = seen_poses(truth, stamps(10, 60), 1e-4, rng)
     of = seen_poses(truth, stamps(20, 55, 1.0123), 1e-4, rng, R_OF_TO.T, 0.02)
     assert any("comes at 10 Hz only" in text for text in alarms(told(Sample(turns_of_poses(of), of.t_ns, reference, 0.02))[1]))
+
+
+def spoilt(poses: PoseSamples, share: float, rng: np.random.Generator) -> PoseSamples:
+    """Return poses of which some are anywhere, as a tracker's that loses its target, as `timeoffset` reads them."""
+    wrong = rng.random(len(poses.t_ns)) < share
+    turn = np.where(wrong[:, None], rng.standard_normal((len(wrong), 3)), 0.0)
+    shift = np.where(wrong[:, None], rng.standard_normal((len(wrong), 3)), 0.0)
+    whole = replace(poses, q=so3.quat_multiply(poses.q, so3.quat_exp(turn)), p=poses.p + shift)
+    return without_jumps(whole)[0]
+
+
+def with_wrong_poses(seed: int, share: float) -> float:
+    """Return the error over sigma of the offset of two streams of poses minutes apart."""
+    rng, td = np.random.default_rng((seed, 9)), 61.73
+    slow = spoilt(seen_poses(path(seed), stamps(20, 38.0, 1.0123), 1e-3, rng, R_OF_TO.T, td), share, rng)
+    fit, said = told(Sample(turns_of_poses(slow), slow.t_ns, spoilt(seen_poses(path(seed), stamps(50, 40.0), 1e-3, rng), share, rng), td))
+    assert said.status is not Status.NOT_OBSERVABLE
+    return (fit.td - td) / fit.sigma
+
+
+@pytest.mark.parametrize("share", [0.003, 0.01, 0.3])
+def test_wrong_poses_do_not_move_the_offset(share: float) -> None:
+    assert abs(with_wrong_poses(2, share)) < 3.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.003, 0.01, 0.05, 0.1, 0.3])
+def test_an_offset_beside_wrong_poses_is_honest(share: float) -> None:
+    z = np.array([with_wrong_poses(seed, share) for seed in range(30)])
+    print(f"{share:.1%} wrong poses, 30 seeds: error over sigma {np.sqrt(np.mean(z**2)):.2f}")
+    assert np.abs(z).max() < 4
+    assert 0.60 < np.sqrt(np.mean(z**2)) < 1.44

@@ -1,9 +1,13 @@
 """Poses that jump away from their neighbours in a stream and back, as a tracker's that has lost its target: by the medoid of a window."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.estimation.pose_interpolation import PoseStream
+from calibkit.data.observations import PoseSamples
+from calibkit.estimation.pose_interpolation import PoseStream, stream_of
+from calibkit.estimation.turns import in_order
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
@@ -12,6 +16,7 @@ _BEYOND = 3.0  # times the window's spread, which holds how fast it turns and mo
 _LEAST = (np.radians(3.0), 0.05)  # rad, m
 _LONGEST_S = 0.75  # from a window's middle to its end: in a longer time a robot goes somewhere and back
 _ROUNDS = 3
+TOLD = 0.01  # of the poses, from which on they are told of
 _CHUNK = 20_000
 
 
@@ -30,6 +35,14 @@ def jumps(stream: PoseStream) -> NDArray[np.bool_]:
         if not len(far):
             break
     return wrong
+
+
+def without_jumps(poses: PoseSamples) -> tuple[PoseSamples, float]:
+    """Return the poses in the order of time without those that jump away and back, and the share of these."""
+    rows = in_order(poses.t_ns)
+    wrong = jumps(stream_of(poses.child, poses).select(rows))
+    rows = rows[~wrong]
+    return replace(poses, t_ns=poses.t_ns[rows], q=poses.q[rows], p=poses.p[rows]), float(np.mean(wrong)) if len(wrong) else 0.0
 
 
 def _far(T: Array) -> NDArray[np.bool_]:

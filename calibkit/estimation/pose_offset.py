@@ -9,7 +9,7 @@ from calibkit.data.progress import Progress, silent
 from calibkit.data.verdict import Reason, Status
 from calibkit.errors import BadInputError
 from calibkit.estimation.pose_interpolation import PoseStream, in_time, without_repeats
-from calibkit.estimation.pose_jumps import jumps
+from calibkit.estimation.pose_jumps import TOLD, jumps
 from calibkit.estimation.stamps import check_stamps
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
@@ -19,7 +19,6 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 MOST_PAIRS = 1000
-_JUMPS = 0.01  # of the poses, from which on they are told of
 _COARSE_S = 0.02  # an offset that turns tell so well is a start: whole poses tell it better
 
 
@@ -121,7 +120,7 @@ def offset_by_turns(
     """
     P, Q = (fast, slow) if read_P else (slow, fast)
     wrong = [jumps(each) for each in (slow, fast)]
-    many = [f"{np.mean(w):.0%} of {each.name}'s" for each, w in zip((slow, fast), wrong, strict=True) if np.mean(w) > _JUMPS]
+    many = [f"{np.mean(w):.0%} of {each.name}'s" for each, w in zip((slow, fast), wrong, strict=True) if np.mean(w) > TOLD]
     said = f"{' and '.join(many)} poses jump away from their neighbours and back, as where a tracker loses its target" if many else ""
     told = _told_by(slow.select(~wrong[0]), fast.select(~wrong[1]), read_P, progress)
     if told.offset is not None:

@@ -13,6 +13,7 @@ from calibkit.detection.tracks import track_features
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.board_poses import board_poses
 from calibkit.estimation.board_turns import turns_of_board
+from calibkit.estimation.pose_jumps import TOLD, without_jumps
 from calibkit.estimation.turns import Turns, turns_of_gyro, turns_of_poses
 from calibkit.estimation.two_view import turns_of_tracks
 from calibkit.geometry import so3
@@ -99,18 +100,21 @@ def _odometer(reader: Reader, sensor: Sensor) -> Seen:
 
 
 def _poses(reader: Reader, sensor: Sensor) -> Seen:
-    return _of_poses(reader, reader.recording.poses(sensor.topic))
+    return _of_poses(reader, sensor, reader.recording.poses(sensor.topic))
 
 
 def _tf(reader: Reader, sensor: Sensor) -> Seen:
     parent, _, child = sensor.topic.removeprefix("tf:").removeprefix("/").partition("/")
     if not (sensor.topic.startswith("tf:") and parent and child):
         raise BadInputError(f"--pose {one_line(sensor.topic)}: of a tf tree name two frames, --pose tf:PARENT/CHILD")
-    return _of_poses(reader, reader.recording.tf(parent, child))
+    return _of_poses(reader, sensor, reader.recording.tf(parent, child))
 
 
-def _of_poses(reader: Reader, poses: PoseSamples) -> Seen:
+def _of_poses(reader: Reader, sensor: Sensor, poses: PoseSamples) -> Seen:
     if reader.inverse_poses:
         R = np.swapaxes(so3.from_quat(poses.q), 1, 2)
         poses = PoseSamples(poses.t_ns, so3.to_quat(R), -(R @ poses.p[:, :, None])[:, :, 0], poses.child, poses.parent)
-    return Seen(lambda: turns_of_poses(poses), poses, poses.t_ns, "poses")
+    steady, wrong = without_jumps(poses)
+    if wrong > TOLD:
+        reader.warnings.append(f"{sensor.name}: {wrong:.0%} of the poses jump away from their neighbours and back; they are left out")
+    return Seen(lambda: turns_of_poses(steady), steady, poses.t_ns, "poses")

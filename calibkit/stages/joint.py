@@ -21,7 +21,7 @@ from calibkit.geometry.so3 import Array
 from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.target_file import load_target
-from calibkit.models.imu import STANDARD_GRAVITY, Gravity
+from calibkit.models.imu import STANDARD_GRAVITY, Gravity, ImuModel
 from calibkit.stages.intrinsics import Options as LensOptions
 from calibkit.stages.intrinsics import name_cameras, observe
 from calibkit.stages.outputs import Outputs, Saved, save
@@ -62,6 +62,7 @@ def joint(
     name, topic = name_imu(recording, base, options.imu)
     lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
     samples = recording.imu(topic, progress)
+    samples = _corrected(samples, base.imus.get(name), name)
     _refuse_imu(samples, name, topic)
     resolution = next(iter(lenses.values())).resolution
     views = observe(recording, topics, board, LensOptions(resolution=resolution, cache=options.cache), progress)
@@ -124,6 +125,21 @@ def _held(camera: Camera) -> tuple[Array, Array]:
     if camera.covariance is None:
         return lens, np.diag(1 / (1e-6 * np.maximum(np.abs(lens), 1e-3)) ** 2)
     return lens, np.linalg.inv(np.array(camera.covariance.matrix))
+
+
+def _corrected(samples: ImuSamples, imu: Imu | None, name: str) -> ImuSamples:
+    """Return the samples as the rig file's scale, axes and biases have them: a_i and w_i in SI."""
+    if imu is None or imu.intrinsics is None or not (samples.has_gyro and samples.has_accel):
+        return samples
+    values = {key: value.value for key, value in imu.intrinsics.parameters.items() if value.value is not None}
+    if missing := sorted(imu.intrinsics.parameters.keys() - values.keys()):
+        raise BadInputError(
+            f"{name}: {', '.join(missing)} of its intrinsics are not known: leave them out of the rig file, or calibrate it"
+        )
+    if samples.unit != imu.intrinsics.unit:
+        raise BadInputError(f"{name}: its samples are in {samples.unit}, its intrinsics in the rig file for {imu.intrinsics.unit}")
+    accel, gyro = ImuModel.of(values).correct(samples.accel, samples.gyro)
+    return replace(samples, accel=accel, gyro=gyro, unit="SI")
 
 
 def _refuse_imu(samples: ImuSamples, name: str, topic: str) -> None:

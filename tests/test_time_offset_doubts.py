@@ -252,12 +252,11 @@ def spoilt(poses: PoseSamples, share: float, rng: np.random.Generator) -> PoseSa
 
 
 def with_wrong_poses(seed: int, share: float) -> float:
-    """Return the error over sigma of the offset of two streams of poses minutes apart."""
+    """Return the error over sigma of the offset of two streams of poses minutes apart, NaN where it is refused."""
     rng, td = np.random.default_rng((seed, 9)), 61.73
     slow = spoilt(seen_poses(path(seed), stamps(20, 38.0, 1.0123), 1e-3, rng, R_OF_TO.T, td), share, rng)
     fit, said = told(Sample(turns_of_poses(slow), slow.t_ns, spoilt(seen_poses(path(seed), stamps(50, 40.0), 1e-3, rng), share, rng), td))
-    assert said.status is not Status.NOT_OBSERVABLE
-    return (fit.td - td) / fit.sigma
+    return float("nan") if said.status is Status.NOT_OBSERVABLE else (fit.td - td) / fit.sigma
 
 
 @pytest.mark.parametrize("share", [0.003, 0.01, 0.3])
@@ -269,6 +268,9 @@ def test_wrong_poses_do_not_move_the_offset(share: float) -> None:
 @pytest.mark.parametrize("share", [0.003, 0.01, 0.05, 0.1, 0.3])
 def test_an_offset_beside_wrong_poses_is_honest(share: float) -> None:
     z = np.array([with_wrong_poses(seed, share) for seed in range(30)])
-    print(f"{share:.1%} wrong poses, 30 seeds: error over sigma {np.sqrt(np.mean(z**2)):.2f}")
-    assert np.abs(z).max() < 4
-    assert 0.60 < np.sqrt(np.mean(z**2)) < 1.44
+    refused = int(np.isnan(z).sum())
+    rms = float(np.sqrt(np.nanmean(z**2)))
+    print(f"{share:.1%} wrong poses, 30 seeds: error over sigma {rms:.2f}, {refused} refused")
+    assert refused <= (2 if share == 0.3 else 0)  # a window in 20 has no majority of right ones then
+    assert np.nanmax(np.abs(z)) < 4
+    assert 0.60 < rms < 1.44

@@ -90,14 +90,13 @@ def check(motion: str, seed: int) -> None:
     MOTIONS[motion](recording, joint, result)
 
 
-@pytest.mark.parametrize("seed", range(1))
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_what_a_motion_leaves_open_is_named(motion: str, seed: int) -> None:
-    check(motion, seed)
+@pytest.mark.parametrize("motion", ["translation", "planar", "static"])
+def test_what_a_motion_leaves_open_is_named(motion: str) -> None:
+    check(motion, 0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 20))
+@pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_a_motion_leaves_open_is_named_over_many_seeds(motion: str, seed: int) -> None:
     check(motion, seed)

@@ -91,11 +91,18 @@ NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
     ),
 }
 ALIKE = {
+    "a large bias",
+    "a second without both",
+    "accelerometer's axis flipped",
+    "accelerometer in g",
     "half a second late",
     "an hour late",
     "4 Hz",
     "2 ms of jitter",
     "lost frames",
+    "3 s without images",
+    "tag spacing",
+    "gyroscope's axes swapped",
     "gyroscope's axis flipped",
     "accelerometer's axes swapped",
 }
@@ -134,7 +141,7 @@ def names(name: str, seed: int) -> None:
 
 
 def some(names: Iterable[str]) -> list[object]:
-    """Return all faults, those that have a like among the others for the slow run."""
+    """Return all faults, those that have a like among the others, or in test_cli_joint, for the slow run."""
     return [pytest.param(name, marks=pytest.mark.slow) if name in ALIKE else name for name in names]
 
 

@@ -16,7 +16,6 @@ from calibkit.estimation.two_view import turns_of_tracks
 from calibkit.geometry import se3, so3
 from calibkit.io.recording import open_recording
 from calibkit.io.rig_file import load_rig
-from calibkit.opencv import cv2
 from calibkit.simulation.render import Renderer
 from calibkit.simulation.scenarios import SCENARIOS
 from calibkit.simulation.session import START_NS, Session, simulate_session
@@ -24,6 +23,9 @@ from calibkit.simulation.truth import true_rig
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8] | NDArray[np.uint16]
+# px rms a component, of features from one image to the next: over 30 textures and three depths 0.0085-0.0115, with OpenCV 4.14 as with 5.0.
+# A third above the worst; more exact would not serve, two grey levels of noise, which real images have, make another 0.010.
+FOLLOWED_PX = 0.015
 SAMPLES = Path(__file__).resolve().parent.parent / "sample_bags"
 
 
@@ -31,21 +33,21 @@ def frame(t_ns: int, image: Gray, label: str | None = None) -> ImageFrame:
     return ImageFrame(t_ns, label or f"image {t_ns}", b"", lambda: image)
 
 
-def textured(shape: tuple[int, int] = (240, 320), seed: int = 0) -> Array:
-    """Blobs of a few pixels all over the image, 0 to 255."""
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(shape), (0, 0), 2.0)
-    return np.clip(128 + 50 * noise / noise.std(), 0, 255)
+def textured(moved: tuple[float, float] = (0, 0), seed: int = 0) -> Array:
+    """Blobs of a few pixels all over 320x240, 0 to 255, moved by just so many pixels: by the phases of its spectrum.
 
-
-def shifted(image: Array, dx: float, dy: float) -> Array:
-    out: Array = cv2.warpAffine(image, np.array([[1, 0, dx], [0, 1, dy]]), image.shape[::-1], flags=cv2.INTER_CUBIC)
-    return np.clip(out, 0, 255)
+    (A warp by OpenCV's cubic is up to 0.05 px off, the more as its version rounds positions: five times what the tracker is.)
+    """
+    shape = (300, 420)  # what leaves it on one side returns on the other
+    across, down = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])[:, None]
+    blobs = np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape)) * np.exp(-8 * np.pi**2 * (across**2 + down**2))
+    there = np.fft.irfft2(blobs * np.exp(-2j * np.pi * (across * moved[0] + down * moved[1])), shape)
+    return np.clip(128 + 50 * there / there.std(), 0, 255)[:240, :320]
 
 
 def moving(n: int = 8, depth: str = "uint8", scale: float = 1.0) -> list[ImageFrame]:
     """A texture that moves by (3.3, -1.7) px a frame."""
-    wide = textured((300, 420))
-    return [frame(k, (scale * shifted(wide, 3.3 * k, -1.7 * k)[30:270, 50:370]).astype(depth)) for k in range(n)]
+    return [frame(k, np.rint(scale * textured((3.3 * k, -1.7 * k))).astype(depth)) for k in range(n)]
 
 
 def displacements(tracks: FeatureTracks) -> Array:
@@ -64,8 +66,8 @@ def test_features_go_where_the_image_goes() -> None:
     assert tracks.labels[3] == "image 3"
     error = displacements(tracks) - [3.3, -1.7]
     assert len(error) > 7 * 100
-    assert np.sqrt(np.mean(error**2)) < 0.05
-    assert np.abs(error).max() < 0.5
+    assert np.sqrt(np.mean(error**2)) < FOLLOWED_PX
+    assert np.abs(error).max() < 0.3  # 0.25 is the worst of the 30
 
 
 def test_features_cover_the_image_in_every_frame() -> None:
@@ -84,12 +86,12 @@ def test_16_bit_images_are_as_good_whatever_range_they_use() -> None:
     for scale in (257.0, 4.0):  # the whole range, and ten bits of it
         tracks = track_features(iter(moving(8, "uint16", scale)), "cam0", silent)
         assert len(tracks.frame) > 0.9 * len(eight.frame)
-        assert np.sqrt(np.mean((displacements(tracks) - [3.3, -1.7]) ** 2)) < 0.05
+        assert np.sqrt(np.mean((displacements(tracks) - [3.3, -1.7]) ** 2)) < FOLLOWED_PX
 
 
 def test_wrong_sizes_stamps_and_images_are_named() -> None:
     images = moving()
-    other = frame(3, textured((240, 300)).astype(np.uint8), "odd.png\n")
+    other = frame(3, textured()[:, :300].astype(np.uint8), "odd.png\n")
     with pytest.raises(BadInputError, match=r"^cam0: image odd\.png is 300x240, image 0 is 320x240: one camera has one image size"):
         track_features(iter([*images[:3], other]), "cam0", silent)
     doubled = [images[0], images[1], replace(images[2], t_ns=1, label="again"), *images[3:]]

@@ -135,8 +135,42 @@ def test_project_finds_the_nearest_rotation() -> None:
     for turn in (1e-3, -1e-3):
         other = nearest @ so3.exp(turn * axes(1)[:1])
         assert np.all(np.linalg.norm(other - noisy, axis=(-1, -2)) > np.linalg.norm(nearest - noisy, axis=(-1, -2)))
-    mirrored = so3.project(np.diag([1.0, 1.0, -1.0]) + 1e-6)
-    assert np.linalg.det(mirrored) == pytest.approx(1)
+
+
+def arun(M: Array) -> Array:
+    """The nearest rotation by singular values: U diag(1, 1, det(U V^T)) V^T."""
+    U, _, Vt = np.linalg.svd(M)
+    sign = np.linalg.det(U @ Vt)
+    out: Array = U @ (np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None] * Vt)
+    return out
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-9, 1e-4, 1.9e-3, 2.1e-3, 5.9e-3, 0.03, 0.5, 5.0])  # on both sides of the switch of methods
+def test_project_agrees_with_singular_values(off: float) -> None:
+    rng = np.random.default_rng(3)
+    turns = so3.exp(rng.normal(size=(2, 4, 50, 3)))
+    stretch = 1 + off * np.array([[1, 1, 1], [-1, -1, -1], [1, -1, 0.5], [-1, 0.3, 0.7]])[:, None, :]
+    M = turns[0] * stretch[..., None, :] @ turns[1]
+    scale = 1 / np.abs(np.sum(np.sort(stretch, axis=-1)[..., :2], axis=-1)).min()  # how much rounding turns the nearest
+    np.testing.assert_allclose(so3.project(M), arun(M), rtol=0, atol=1e-14 * max(1, scale))
+    mirrored = M * np.array([1.0, 1.0, -1.0])
+    if off:  # of a mirror image itself all turns of it are as near
+        assert np.linalg.det(so3.project(mirrored)) == pytest.approx(1, abs=1e-13)
+
+
+def test_project_takes_near_and_far_and_mirrored_together_one_or_none() -> None:
+    rng = np.random.default_rng(4)
+    R = so3.exp(rng.normal(size=(4, 3)))
+    M = np.stack([R[0], R[1] + 1e-3, 3 * R[2] + 0.1 * rng.normal(size=(3, 3)), R[3] * np.array([1.0, 1.0, -1.0]) + 0.01])
+    np.testing.assert_allclose(so3.project(M), arun(M), rtol=0, atol=1e-13)
+    for one, all_at_once in zip(M, so3.project(M), strict=True):
+        np.testing.assert_allclose(so3.project(one), all_at_once, rtol=0, atol=1e-14)
+        assert so3.project(one).shape == (3, 3)
+    assert so3.project(np.zeros((2, 0, 3, 3))).shape == (2, 0, 3, 3)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(np.linalg.LinAlgError):
+            so3.project(np.where(np.eye(3) > 0, wrong, 0.0))
+    np.testing.assert_allclose(so3.project(1e200 * R), R, atol=1e-14)
 
 
 def test_hat_is_the_cross_product() -> None:

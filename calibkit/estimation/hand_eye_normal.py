@@ -1,5 +1,6 @@
 """The normal equations of a hand-eye problem, e = -x + Ad(M^-1) z with noise of covariance C, and what of x they really tell."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,6 +65,14 @@ class Normal:
         return replace(normal(data, M, C, e, kept), free=self.free).step(data, e)
 
 
+def each(f: Callable[[Array], Array], values: Array) -> Array:
+    """Return f of matrices (n, ...), one by one or, where they are a view of one n times, of that."""
+    if len(values) > 1 and values.strides[0] == 0:
+        one = f(values[:1])
+        return np.broadcast_to(one, (len(values), *one.shape[1:]))
+    return f(values)
+
+
 def inverse(C: Array) -> Array:
     """Return the inverses of covariances (n, k, k) by Gauss and Jordan, all at once: a third of the time of as many calls of LAPACK.
 
@@ -85,7 +94,7 @@ def normal(data: HandEyeData, M: Array, C: Array, e: Array, kept: Mask) -> Norma
 
     A world with fewer than two kept poses says nothing of X; its Z is that of all its poses.
     """
-    W = inverse(C)
+    W = each(inverse, C)
     J_Z = se3.adjoint(se3.inverse(M))
     active = (np.bincount(data.world, kept, data.n_worlds) >= 2)[data.world]
     WJ = W @ J_Z * (kept | ~active)[:, None, None]

@@ -141,6 +141,8 @@ def residuals(data: HandEyeData, X: Array, Z: Array, M: Array) -> tuple[Array, A
         kinds += _isotropic(se3.inverse(M) if data.words.Q_at_world else np.eye(4))
     else:
         kinds.append(data.cov_Q)
+    if all(kind.ndim == 2 for kind in kinds):
+        return e, away, np.broadcast_to(np.array(kinds), (len(M), len(kinds), 6, 6))
     out = np.empty((len(M), len(kinds), 6, 6))
     for k, kind in enumerate(kinds):
         out[:, k] = kind

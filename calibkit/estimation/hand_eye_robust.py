@@ -83,7 +83,7 @@ def worlds(data: HandEyeData, X: Array, kept: Mask) -> Array:
     used = (slots >= 0) & (kept[slots] | lonely[:, None])
     Z = _median(each.reshape(-1, 16)[slots], used).reshape(-1, 4, 4)
     Z = se3.make(so3.project(Z[:, :3, :3]), Z[:, :3, 3])
-    for _ in range(2):
+    for _ in range(2 if slots.shape[1] > 2 else 0):  # of two poses it is their mean already
         Z = se3.retract(Z, _median(se3.local(Z[data.world], each)[slots], used))
     return Z
 

@@ -14,7 +14,6 @@ from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset_verdict import judge_time_offset
-from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import grade
 
 _VERDICTS = {Status.DETERMINED: Verdict.PASS, Status.WEAK: Verdict.CHECK, Status.NOT_OBSERVABLE: Verdict.FAIL}
@@ -202,9 +201,3 @@ def known(statuses: tuple[Status, ...], where: slice) -> Status:
     """Return the worst of some parameters' statuses."""
     order = (Status.DETERMINED, Status.WEAK, Status.NOT_OBSERVABLE)
     return max(statuses[where], key=order.index)
-
-
-def parameter_sigma(cov: Array, where: slice) -> Array:
-    """Return sigma of each of some parameters."""
-    sigma: Array = np.sqrt(np.diag(cov)[where])
-    return sigma

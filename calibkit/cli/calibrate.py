@@ -14,15 +14,10 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    sources: Annotated[
-        list[Path], typer.Argument(metavar="SOURCE...", help="Bags, folders or CSV files with images or corners of a board, and an IMU.")
-    ],
-    target: Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target file, or calibkit target's.")],
+    sources: options.BoardAndImu,
+    target: options.Target,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")],
-    camera: Annotated[
-        list[str] | None,
-        typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: the only one]"),
-    ] = None,
+    camera: options.Cameras = None,
     imu: options.Imu = None,
     model: Annotated[
         list[str] | None, typer.Option("--model", help="Lens model, as for intrinsics; once or per camera. [default: by held-out error]")

@@ -72,7 +72,7 @@ def run(
     predict: Annotated[int, typer.Option("--predict", metavar="N", help="Tell the sigma that N more good poses would bring.")] = 0,
     model: Annotated[str, typer.Option("--model", help="Of a lens that no rig file has, and is calibrated on the way.")] = "auto",
     resolution: options.Resolution = None,
-    no_cache: Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")] = False,
+    no_cache: options.NoCache = False,
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
     strict: options.Strict = False,

@@ -20,7 +20,7 @@ def run(
     sources: Annotated[
         list[Path], typer.Argument(metavar="SOURCE...", help="Bags, image folders, ASL folders or CSV files, on one clock.")
     ],
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything as JSON.")] = None,
+    json_file: options.Json = None,
     rate: options.Rate = None,
     gyro_unit: options.GyroUnit = None,
     accel_unit: options.AccelUnit = None,

@@ -17,11 +17,8 @@ def run(
     sources: Annotated[
         list[Path], typer.Argument(metavar="SOURCE...", help="Bags, image folders, ASL folders or corner CSV files, on one clock.")
     ],
-    target: Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target YAML.")],
-    camera: Annotated[
-        list[str] | None,
-        typer.Option("--camera", metavar="TOPIC", help="Image topic, or cam0=/topic; repeat for several cameras. [default: the only one]"),
-    ] = None,
+    target: options.Target,
+    camera: options.Cameras = None,
     model: Annotated[
         list[str] | None,
         typer.Option(
@@ -38,7 +35,7 @@ def run(
         str, typer.Option("--loss", help="robust (outliers are found and given up) or plain (least squares over everything).")
     ] = "robust",
     max_views: Annotated[int, typer.Option("--max-views", min=10, help="Beyond this many, the most telling moments are chosen.")] = 1500,
-    no_cache: Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")] = False,
+    no_cache: options.NoCache = False,
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
     strict: options.Strict = False,

@@ -1,6 +1,5 @@
 """`calibkit joint`: cameras and an IMU on one trajectory."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,10 +13,8 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    sources: Annotated[
-        list[Path], typer.Argument(metavar="SOURCE...", help="Bags, folders or CSV files with images or corners of a board, and an IMU.")
-    ],
-    target: Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target file, or calibkit target's.")],
+    sources: options.BoardAndImu,
+    target: options.Target,
     camera: Annotated[
         list[str] | None,
         typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
@@ -41,7 +38,7 @@ def run(
     rate: options.Rate = None,
     gyro_unit: options.GyroUnit = None,
     accel_unit: options.AccelUnit = None,
-    no_cache: Annotated[bool, typer.Option("--no-cache", help="Look for corners again, even where they were found before.")] = False,
+    no_cache: options.NoCache = False,
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
     strict: options.Strict = False,

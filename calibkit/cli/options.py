@@ -12,6 +12,14 @@ if TYPE_CHECKING:
     from calibkit.models.imu import Gravity
     from calibkit.stages.outputs import Outputs
 
+BoardAndImu = Annotated[
+    list[Path], typer.Argument(metavar="SOURCE...", help="Bags, folders or CSV files with images or corners of a board, and an IMU.")
+]
+Target = Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The board: Kalibr's target file, or calibkit target's.")]
+Cameras = Annotated[
+    list[str] | None,
+    typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: the only one]"),
+]
 Imu = Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")]
 Out = Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")]
 Rigs = Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add the result to; repeatable.")]
@@ -30,6 +38,7 @@ LocalGravity = Annotated[float | None, typer.Option("--gravity", metavar="M/S2",
 Latitude = Annotated[float | None, typer.Option("--latitude", metavar="DEG", help="Or where it was, for normal gravity.")]
 Altitude = Annotated[float | None, typer.Option("--altitude", metavar="M", help="With --latitude: above the sea.")]
 Resolution = Annotated[str | None, typer.Option("--resolution", metavar="WxH", help="Image size of a corner file, such as 752x480.")]
+NoCache = Annotated[bool, typer.Option("--no-cache", help="Find all corners anew, remember none.")]
 RosDistro = Annotated[str | None, typer.Option("--ros-distro", help="ROS 2 distribution of bags that do not say it (humble, jazzy, ...).")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 on CHECK, too.")]

@@ -72,7 +72,7 @@ def run(
     rate: options.Rate = None,
     gyro_unit: options.GyroUnit = None,
     accel_unit: options.AccelUnit = None,
-    no_cache: Annotated[bool, typer.Option("--no-cache", help="Look for corners again, even where they were found before.")] = False,
+    no_cache: options.NoCache = False,
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
     strict: options.Strict = False,

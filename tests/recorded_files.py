@@ -25,6 +25,12 @@ def write_poses(file: Path, poses: PoseSamples) -> Path:
     return table(file, "t [ns],x,y,z,qx,qy,qz,qw", poses.t_ns, poses.p, poses.q)
 
 
+def write_session(folder: Path, session: Session) -> tuple[Path, Path]:
+    """Return the files of its IMU and of its first camera's corners."""
+    assert session.imu is not None
+    return write_imu(folder / "imu.csv", session.imu), write_corners(folder / "corners.csv", session)
+
+
 def write_corners(file: Path, session: Session) -> Path:
     views, _ = simulate_views(session)
     columns = (views.t_ns[views.frame], views.corner // 4, views.corner % 4, views.uv)

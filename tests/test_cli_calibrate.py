@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import Run
-from recorded_files import write_corners, write_imu
+from recorded_files import write_session
 from time_offset_samples import camera_session, lens
 
 from calibkit.data.rig import Rig
@@ -46,9 +46,7 @@ def session() -> Session:
 @pytest.fixture(scope="module")
 def folder(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("recording")
-    assert session.imu is not None
-    write_imu(made / "imu.csv", session.imu)
-    write_corners(made / "corners.csv", session)
+    write_session(made, session)
     (made / "target.yaml").write_text(dump_target(session.board_told))
     save_rig(Rig(cameras={"cam0": lens(session).model_copy(update={"topic": "corners"})}), made / "lens.yaml")
     return made

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from commands import Run, Said
 from matplotlib.figure import Figure
-from recorded_files import table, write_corners, write_imu, write_poses
+from recorded_files import table, write_imu, write_poses, write_session
 from recording_helper import Make, write
 from time_offset_samples import R_OF_TO, camera_session, constant_rate, lens, path, pose_imu, seen_gyro, seen_poses, stamps, wheels_imu
 
@@ -47,9 +47,7 @@ class Files:
     def __init__(self, folder: Path, motion: str = "rich", td: float = TD) -> None:
         self.folder = folder
         self.session = camera_session(0, td, duration_s=DURATION_S, motion=motion)
-        assert self.session.imu is not None
-        self.imu = write_imu(folder / "imu.csv", self.session.imu)
-        self.corners = write_corners(folder / "corners.csv", self.session)
+        self.imu, self.corners = write_session(folder, self.session)
         self.target = folder / "target.yaml"
         self.target.write_text(dump_target(self.session.board_told))
         self.lens = save(Rig(cameras={"cam0": lens(self.session).model_copy(update={"topic": "corners"})}), folder / "lens.yaml")

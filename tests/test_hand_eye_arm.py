@@ -95,7 +95,7 @@ def test_what_is_moved_half_way_fails_with_its_size_and_where(what: str, size: f
         assert reason.verdict is Verdict.FAIL
         moved = "T_gripper_cam is another one" if what == "tool" else "T_base_target is another one"
         assert f"from pose 11 on {moved}, by " in reason.text
-        assert float(reason.text.partition(" by ")[2].partition(" mm")[0]) == pytest.approx(1e3 * size, abs=1.5)
+        assert float(reason.text.partition(" by ")[2].partition(" mm")[0]) == pytest.approx(1e3 * size, abs=0.6)
         # No X fits both: nothing of it is told as determined.
         for entry in result.rig.transforms.values():
             assert Status.DETERMINED not in {entry.status, *entry.statuses.values()}

@@ -58,8 +58,9 @@ def test_one_jump_in_a_short_recording_is_no_jitter_and_no_other_rate(hz: float,
     for at in (40, 125, 160, 240):
         for jump_ns in (-33_000_000, 15_000_000, 33_000_000):
             report = check_stamps(t_ns + jump_ns * (np.arange(250) >= at))
-            assert report.jitter_s == pytest.approx(jitter_s, rel=0.25, abs=1e-9)
-            assert report.rate_hz == pytest.approx(hz, rel=1e-9 + jitter_s)  # 33 ms are 0.4 ms off a period of 29.97 Hz
+            a_frame = hz == 29.97 and abs(jump_ns) == 33_000_000  # one more or less, and the 0.4 ms that it is off a period jitter
+            assert report.jitter_s == pytest.approx(jitter_s, rel=0.25 if a_frame else 0.05, abs=1e-9)
+            assert report.rate_hz == pytest.approx(hz, rel=1e-9 + jitter_s)
 
 
 def test_stamps_are_of_what_the_stream_has() -> None:

@@ -9,6 +9,7 @@ from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.result import Result
 from calibkit.estimation.joint import CameraInput, ImuNoise, Joint, Settings, calibrate_joint
 from calibkit.estimation.joint_checks import check_joint
+from calibkit.estimation.joint_imu import ImuInput
 from calibkit.estimation.joint_result import joint_result
 from calibkit.estimation.joint_trust import Trust, joint_trust
 from calibkit.estimation.stamps import check_stamps
@@ -38,11 +39,11 @@ class Recording:
     def fitted(self, settings: Settings | None = None) -> Joint:
         return calibrate_joint([self.camera], self.imu, self.noise, settings)
 
-    def result(self, joint: Joint, halves: bool = False) -> Result:
+    def result(self, joint: Joint, halves: bool = False, imu: ImuInput | None = None) -> Result:
         """Return what the command would say of the fit."""
         trust, checks = joint_trust(joint.fit), check_joint(joint.fit, halves)
         stamps = {"imu0": check_stamps(self.imu.t_ns, "sample"), "cam0": check_stamps(self.views.t_ns, "frame")}
-        return joint_result(joint, trust, checks, [self.camera], "imu0", stamps)
+        return joint_result(joint, trust, checks, [self.camera], "imu0", imu or ImuInput(self.imu), stamps)
 
 
 def recorded(seed: int, duration_s: float = 30.0, noise_px: float = 0.2, motion: str = "rich", faults: tuple[str, ...] = ()) -> Recording:

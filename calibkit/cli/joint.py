@@ -1,6 +1,6 @@
 """`calibkit joint`: cameras and an IMU on one trajectory."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -27,6 +27,14 @@ def run(
     hold_lens: Annotated[
         bool,
         typer.Option("--hold-lens", help="Keep the lens near the rig file's, by its covariance: where that is from another recording."),
+    ] = False,
+    imu_model: Annotated[
+        Literal["known", "scale-misalignment"],
+        typer.Option("--imu-model", help="The IMU's scale and axes: as known (the rig file's, by their covariance, else ideal), or free."),
+    ] = "known",
+    g_sensitivity: Annotated[bool, typer.Option("--g-sensitivity", help="Free, too: how the gyroscope feels acceleration.")] = False,
+    line_delay: Annotated[
+        bool, typer.Option("--line-delay", help="Free, too: a rolling shutter's time from row to row; stamps are the middle row's.")
     ] = False,
     knots: Annotated[
         float | None, typer.Option("--knots", metavar="MS", help="Between the trajectory's knots. [default: as the IMU's samples ask for]")
@@ -64,6 +72,9 @@ def run(
         gravity=options.gravity_of(gravity, latitude, altitude),
         knots_s=None if knots is None else knots * 1e-3,
         hold_lens=hold_lens,
+        imu_model=imu_model,
+        g_sensitivity=g_sensitivity,
+        line_delay=line_delay,
         halves=not no_halves,
         cache=not no_cache,
         ros_distro=ros_distro,

@@ -131,6 +131,7 @@ class Camera(Record):
     equation: Text = ""
     parameters: dict[str, Estimate]
     covariance: Covariance | None = None
+    line_delay: Estimate | None = None  # s from one row to the next of a rolling shutter; None: all rows at once, as far as is known
     reprojection: Reprojection | None = None
     verdict: Verdict | None = None  # None: given, not judged
     reasons: Texts = []

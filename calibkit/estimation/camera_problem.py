@@ -200,21 +200,26 @@ class Shutter:
 
     twist: Array  # (f, 6) how points move in the camera frame, rho + phi x p, 1/s
     late: Array  # (f, n) s by which each corner's row is read after the pose's time
-    by_unknown: Array  # (f, n) d late / d(the unknown)
+    by_unknown: Array | None = None  # (f, n) d late / d(the unknown); None: none is free
+
+    def moved(self, in_camera: Array) -> Array:
+        """Return points in the camera frame (f, n, 3) as they are when their row is read."""
+        rho, phi = self.twist[:, None, :3], self.twist[:, None, 3:]
+        out: Array = in_camera + self.late[..., None] * (rho + np.cross(phi, in_camera))
+        return out
 
 
 def corner_products(
     points: Array, views: CameraViews, rows: slice, T_cam_board: Array, lens: Array, loss_scale: float, shutter: Shutter | None = None
 ) -> tuple[Array, float]:
-    """Return per view the products G of its columns [motion | lens | shutter's unknown | residual], and the robust cost.
+    """Return per view the products G of its columns [motion | lens | the shutter's unknown, where free | residual], and the robust cost.
 
     The motion moves a point in the camera frame by rho + phi x p.
     """
     weight = views.weight[rows]
     in_camera = se3.transform(T_cam_board, points)
     if shutter is not None:
-        rho, phi = shutter.twist[:, None, :3], shutter.twist[:, None, 3:]
-        in_camera = in_camera + shutter.late[..., None] * (rho + np.cross(phi, in_camera))
+        in_camera = shutter.moved(in_camera)
     projection = views.model.project(in_camera, lens, jacobians=True)
     assert projection.J_point is not None
     assert projection.J_params is not None
@@ -228,14 +233,14 @@ def corner_products(
 
     down = np.sqrt(down)
     w = np.where(usable, weight * down, 0.0)
-    K = np.empty((2, 6 + len(lens) + (shutter is not None) + 1, *w.shape))
+    K = np.empty((2, 6 + len(lens) + (shutter is not None and shutter.by_unknown is not None) + 1, *w.shape))
     np.multiply(np.moveaxis(projection.J_point, (-2, -1), (0, 1)), w, out=K[:, :3])
     p = np.moveaxis(in_camera, -1, 0)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         np.subtract(p[i] * K[:, j], p[j] * K[:, i], out=K[:, 3 + k])
     np.multiply(np.moveaxis(projection.J_params, (-2, -1), (0, 1)), w, out=K[:, 6 : 6 + len(lens)])
-    if shutter is not None:
+    if shutter is not None and shutter.by_unknown is not None:
         K[:, -2] = np.einsum("xkfn,fk->xfn", K[:, :6], shutter.twist) * shutter.by_unknown
     np.multiply(r, down, out=K[:, -1])
     G: Array = np.matmul(K.transpose(0, 2, 1, 3), K.transpose(0, 2, 3, 1)).sum(axis=0)

@@ -55,6 +55,7 @@ class CameraInput:
     views: BoardViews
     camera: Camera
     lens_prior: tuple[Array, Array] | None = None  # lens and information, where these come from another recording
+    lens_given: bool = False  # it has no covariance and is held: no sigma holds its error
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Settings:
     gravity: GravityPrior = _STANDARD
     spacing: float | None = None  # s, of the knots; None: chosen by the IMU's samples
     imu: ImuModel = field(default_factory=ImuModel)  # scale, misalignment and sensitivity as known so far; its biases are not used
+    imu_information: Array | None = None  # about what is free of it, in the order of joint_state.IMU_MODEL; None: nothing is known
     extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
 
 
@@ -98,7 +100,9 @@ def calibrate_joint(
 
 
 def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise, settings: Settings, progress: Progress) -> Joint:
-    imu = imu.select(in_order(imu.t_ns))
+    measured = imu.select(in_order(imu.t_ns))
+    accel, gyro = settings.imu.correct(measured.accel, measured.gyro)
+    imu = replace(measured, accel=accel, gyro=gyro)  # near enough for the start
     poses = [_posed(each) for each in progress(cameras, "board poses", len(cameras))]
     turns = [fit_time_offset(turns_of_board(each), imu, TurnSettings()) for each in progress(poses, "time offset", len(poses))]
     seeds = [seed_camera(pose, turn, imu) for pose, turn in zip(poses, turns, strict=True)]
@@ -111,7 +115,7 @@ def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise,
     if high - low < _LEAST_S:
         raise BadInputError("cameras and IMU share too little time: record both at once, 10 s or more")
     inside = (t >= low) & (t <= high)
-    rates = np.concatenate([imu.gyro, imu.accel], axis=1)[inside]
+    rates = np.concatenate([measured.gyro, measured.accel], axis=1)[inside]
     fine = fineness(t[inside], rates)
     spacing = settings.spacing or fine.chosen
     knots = Knots(float(low), spacing, ORDER, int(np.ceil((high - low) / spacing)))
@@ -126,7 +130,7 @@ def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise,
         order = np.flatnonzero(inner)[np.argsort(at[inner], kind="stable")]
         posed = Posed(at[order], pose.T_cam_board[order], _lens(each.camera))
         start = (
-            seed_trajectory(knots, posed, seed, rows.t, rows.accel, settings.gravity.size)
+            seed_trajectory(knots, posed, seed, rows.t, imu.accel[inside], settings.gravity.size)
             if start is None
             else camera_beside(start, knots, posed, seed)
         )
@@ -138,9 +142,14 @@ def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise,
         tuple(grids),
         settings.gravity,
         lens_priors=tuple(each.lens_prior for each in cameras),
+        imu_prior=None if settings.imu_information is None else (settings.imu, settings.imu_information),
         extras=settings.extras,
     )
-    fit = fit_joint(problem, replace(start, imu=settings.imu))
+    delays = [0.0 if each.camera.line_delay is None else each.camera.line_delay.value or 0.0 for each in cameras]
+    start = replace(
+        start, imu=settings.imu, cameras=tuple(replace(x, line_delay=delay) for x, delay in zip(start.cameras, delays, strict=True))
+    )
+    fit = fit_joint(problem, start)
     told = (noise.gyro_noise_density is not None, noise.accel_noise_density is not None)
     walks = (noise.gyro_random_walk is not None, noise.accel_random_walk is not None)
     return Joint(fit, origin, tuple(poses), tuple(turns), tuple(seeds), tuple(used), fine, rate_hz, told, walks)

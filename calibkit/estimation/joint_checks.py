@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
 from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import SCALE, JointState
+from calibkit.estimation.joint_state import LINE, LINE_SCALE, SCALE, JointState, model_step
 from calibkit.estimation.joint_trust import border_scales, joint_covariance
 from calibkit.estimation.lens_fit import rows_of
 from calibkit.geometry import se3
@@ -34,28 +34,33 @@ class Checks:
     """What was asked of the estimate."""
 
     board_scale: tuple[float, float]  # by the accelerations, with sigma
+    line_delays: tuple[tuple[float, float] | None, ...]  # s a row, with sigma, of each camera's shutter; None: free or known
     halves: Halves | None
 
 
 def check_joint(fit: JointFit, halves: bool = True) -> Checks:
     """Return the checks."""
     with threadpool_limits(1, user_api="blas"):
-        return Checks(board_scale(fit), _halves(fit) if halves else None)
+        return Checks(*suspects(fit), _halves(fit) if halves else None)
 
 
-def board_scale(fit: JointFit) -> tuple[float, float]:
-    """Return the board's size over what its file says, one Gauss-Newton step with that in the border, and its sigma."""
-    if SCALE in fit.problem.extras:
-        return fit.x.board_scale, 0.0
-    asked = replace(fit, problem=replace(fit.problem, extras=(*fit.problem.extras, SCALE)))
+def suspects(fit: JointFit) -> tuple[tuple[float, float], tuple[tuple[float, float] | None, ...]]:
+    """Return the board's size over what its file says and each camera's line delay, one Gauss-Newton step with these in the border."""
+    cameras = range(len(fit.problem.cameras))
+    shut = LINE not in fit.problem.extras and not any(camera.line_delay for camera in fit.x.cameras)
+    asked = replace(fit, problem=replace(fit.problem, extras=(*fit.problem.extras, SCALE, *((LINE,) if shut else ()))))
     _, system = asked.problem.linearize(fit.x)
     asked = replace(asked, system=system, drawn=draw(system, DRAWS))
     answer, S = schur(system)
     g = system.gradient_border - answer.T @ system.gradient_core.ravel()
     scales = border_scales(asked)
     step = np.linalg.lstsq(S * scales[:, None] * scales, scales * g, rcond=1e-14)[0] * scales
-    k = asked.problem.border[SCALE].start
-    return 1 + float(step[k]), float(np.sqrt(joint_covariance(asked, scales).corrected[k, k]))
+    sigma, border = np.sqrt(np.diag(joint_covariance(asked, scales).corrected)), asked.problem.border
+    k = border[SCALE].start
+    lines = [border[f"{LINE} {c}"].start if shut else None for c in cameras]
+    return (1 + float(step[k]), float(sigma[k])), tuple(
+        None if i is None else (LINE_SCALE * float(step[i]), LINE_SCALE * float(sigma[i])) for i in lines
+    )
 
 
 def _halves(fit: JointFit) -> Halves | None:
@@ -88,10 +93,15 @@ def _difference(a: JointFit, b: JointFit) -> Array:
     """Return the step of the border from a to b."""
     border = a.problem.border
     out = np.zeros(border.size)
+    for name, step in model_step(a.x.imu, b.x.imu).items():
+        if name in border.extras:
+            out[border[name]] = step
     for c, (one, two) in enumerate(zip(a.x.cameras, b.x.cameras, strict=True)):
         out[border[f"T {c}"]] = se3.local(one.T_cam_imu, two.T_cam_imu)
         out[border[f"dt {c}"]] = two.dt - one.dt
         out[border[f"lens {c}"]] = two.lens - one.lens
+        if LINE in border.extras:
+            out[border[f"{LINE} {c}"]] = (two.line_delay - one.line_delay) / LINE_SCALE
     return out
 
 

@@ -11,7 +11,7 @@ from calibkit.estimation.joint_problem import JointProblem
 from calibkit.estimation.joint_state import JointState
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
-from calibkit.geometry.spline import Steps, basis, turning
+from calibkit.geometry.spline import Steps
 from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.levenberg_marquardt import minimise
 from calibkit.solver.robust import scale_of_norms
@@ -76,20 +76,11 @@ def _settled(scales: dict[str, float]) -> bool:
 def corner_residuals(problem: JointProblem, x: JointState, c: int) -> tuple[Array, NDArray[np.bool_]]:
     """Return measured minus predicted corners of camera c (f, n, 2) px, and where the model has a prediction (f, n)."""
     frames, camera = problem.cameras[c], x.cameras[c]
-    in_camera = se3.transform(poses_of_board(problem, x, c), problem.points)
-    projection = frames.views.model.project(in_camera, camera.lens)
+    seen = problem.seen(x, Steps.of(x.R), c)
+    in_camera = se3.transform(seen.T_cam_board, problem.points)
+    shutter = problem.shutter(x, c, seen.twist)
+    projection = frames.views.model.project(in_camera if shutter is None else shutter.moved(in_camera), camera.lens)
     return np.where(projection.valid[..., None], frames.views.uv - projection.uv, 0.0), projection.valid
-
-
-def poses_of_board(problem: JointProblem, x: JointState, c: int) -> Array:
-    """Return T_cam_board (f, 4, 4) of camera c's frames."""
-    frames, camera = problem.cameras[c], x.cameras[c]
-    i, u = problem.knots.locate(frames.t + camera.dt)
-    value = basis(problem.knots, u)
-    at = turning(x.R, Steps.of(x.R), i, value, basis(problem.knots, u, 1), jacobians=False)
-    p = np.einsum("nl,nlk->nk", value, x.p[i[:, None] + np.arange(problem.knots.order)])
-    out: Array = camera.T_cam_imu @ se3.inverse(se3.make(at.R, p))
-    return out
 
 
 def _robust_scales(problem: JointProblem, x: JointState, found: Sequence[Array]) -> dict[str, float]:

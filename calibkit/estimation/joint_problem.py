@@ -16,10 +16,26 @@ from numpy.typing import NDArray
 
 from calibkit.estimation.camera_problem import CameraViews, Shutter, corner_products, map_views
 from calibkit.estimation.joint_parts import Index, Part, assemble
-from calibkit.estimation.joint_state import A_G, EXTRAS, KNOT, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE, Border, JointState, retract
+from calibkit.estimation.joint_state import (
+    A_G,
+    EXTRAS,
+    IMU_MODEL,
+    KNOT,
+    LINE,
+    LINE_SCALE,
+    M_A,
+    M_G,
+    PHI,
+    SCALE,
+    Border,
+    JointState,
+    model_step,
+    retract,
+)
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
-from calibkit.geometry.spline import Knots, Steps, basis, turning
+from calibkit.geometry.spline import Knots, Steps, Turning, basis, turning
+from calibkit.models.imu import ImuModel
 from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.robust import cauchy
 
@@ -57,6 +73,17 @@ class GravityPrior:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """One camera's frames on the trajectory."""
+
+    i: Index  # (f,) segment
+    value: Array  # (f, order) of the basis
+    at: Turning
+    T_cam_board: Array  # (f, 4, 4)
+    twist: Array  # (f, 6) how the board's points move in the camera frame, rho + phi x p, 1/s
+
+
+@dataclass(frozen=True)
 class JointProblem:
     """All measurements of a recording."""
 
@@ -67,6 +94,7 @@ class JointProblem:
     gravity: GravityPrior
     loss_scale: float = np.inf  # Cauchy's, in sigmas
     lens_priors: tuple[tuple[Array, Array] | None, ...] = ()  # lens and information (l, l) of each camera, where it is known
+    imu_prior: tuple[ImuModel, Array] | None = None  # and information about what is free of it, in the order of IMU_MODEL
     extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
     held: bool = False  # the calibration, and the trajectory alone is free
 
@@ -105,6 +133,12 @@ class JointProblem:
                 off = lens - x.cameras[c].lens
                 C[where, where], g[where] = information, information @ off
                 cost += float(off @ information @ off)
+        if self.imu_prior is not None:
+            model, information = self.imu_prior
+            at, steps = self.border.of_model, model_step(x.imu, model)
+            off = np.concatenate([steps[name] for name in IMU_MODEL if name in self.extras])
+            C[np.ix_(at, at)], g[at] = information, information @ off
+            cost += float(off @ information @ off)
         return cost, C, g
 
     def parts(self, x: JointState) -> Iterator[Part]:
@@ -191,29 +225,41 @@ class JointProblem:
         touch, cost = np.arange(where.start, where.stop), float(np.sum(loss[keep]))
         return Part(kind, self.knots.middle(segment), segment, offsets, touch, N, cost, 3 * int(keep.sum()))
 
+    def seen(self, x: JointState, steps: Steps, c: int, jacobians: bool = False) -> "Seen":
+        """Return how camera c's frames lie before the board."""
+        camera = x.cameras[c]
+        i, u = self.knots.locate(self.cameras[c].t + camera.dt)
+        value, rate = basis(self.knots, u), basis(self.knots, u, 1)
+        at = turning(x.R, steps, i, value, rate, jacobians)
+        near = i[:, None] + np.arange(self.knots.order)
+        position, velocity = (np.einsum("nl,nlk->nk", w, x.p[near]) for w in (value, rate))
+        moving = np.concatenate([(np.swapaxes(at.R, 1, 2) @ velocity[..., None])[..., 0], at.omega], axis=1)
+        T = camera.T_cam_imu @ se3.inverse(se3.make(at.R, position))
+        return Seen(i, value, at, T, -moving @ se3.adjoint(camera.T_cam_imu).T)
+
+    def shutter(self, x: JointState, c: int, twist: Array, rows: slice = slice(None)) -> Shutter | None:
+        """Return how late the corners of some frames are read; None where all rows are read at once."""
+        free, delay, views = LINE in self.extras, x.cameras[c].line_delay, self.cameras[c].views
+        if not free and delay == 0:
+            return None
+        row = views.uv[rows, :, 1] - (views.image_size[1] - 1) / 2
+        return Shutter(twist[rows], delay * row, LINE_SCALE * row if free else None)
+
     def frame_parts(self, x: JointState, steps: Steps, c: int) -> Iterator[Part]:
         """Yield what camera c's corners say."""
         frames, camera, k = self.cameras[c], x.cameras[c], self.knots.order
-        i, u = self.knots.locate(frames.t + camera.dt)
-        value, rate = basis(self.knots, u), basis(self.knots, u, 1)
-        at = turning(x.R, steps, i, value, rate)
-        near = i[:, None] + np.arange(k)
-        position, velocity = (np.einsum("nl,nlk->nk", w, x.p[near]) for w in (value, rate))
+        seen = self.seen(x, steps, c, jacobians=True)
+        i, value, at, T, twist = seen.i, seen.value, seen.at, seen.T_cam_board, seen.twist
         RT = np.swapaxes(at.R, 1, 2)
         # A point's motion in the camera frame, by the knots, T_cam_imu and dt: rho - R^T dp and phi - dR in the IMU's.
         into = se3.adjoint(camera.T_cam_imu)
-        T = camera.T_cam_imu @ se3.inverse(se3.make(at.R, position))
-        twist = -np.concatenate([(RT @ velocity[..., None])[..., 0], at.omega], axis=1) @ into.T
         by_knot = np.zeros((len(i), 6, k, 6))
         by_knot[:, :3, :, 3:] = -value[:, None, :, None] * RT[:, :, None, :]
         by_knot[:, 3:, :, :3] = -at.dR
         motion = np.concatenate([into @ by_knot.reshape(len(i), 6, -1), np.broadcast_to(into, (len(i), 6, 6)), twist[..., None]], axis=2)
 
         def products(rows: slice) -> tuple[slice, Array, float]:
-            shutter = None
-            if LINE in self.extras:
-                row = frames.views.uv[rows, :, 1] - (frames.views.image_size[1] - 1) / 2
-                shutter = Shutter(twist[rows], camera.line_delay * row, LINE_SCALE * row)
+            shutter = self.shutter(x, c, twist, rows)
             return rows, *corner_products(self.points, frames.views, rows, T[rows], camera.lens, self.loss_scale, shutter)
 
         offsets = (KNOT * np.arange(k)[:, None] + np.arange(6)).ravel()

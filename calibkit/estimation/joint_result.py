@@ -6,33 +6,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.result import ResidualSet, Result
-from calibkit.data.rig import Camera, Estimate, Reprojection, Rig
+from calibkit.data.rig import Camera, Estimate, Imu, Reprojection, Rig
 from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
 from calibkit.data.verdict import Status
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_checks import Checks
-from calibkit.estimation.joint_fit import corner_residuals, poses_of_board
+from calibkit.estimation.joint_fit import corner_residuals
+from calibkit.estimation.joint_imu import ImuInput, intrinsics_of
 from calibkit.estimation.joint_noise import draw
-from calibkit.estimation.joint_state import BIASES, KNOT
+from calibkit.estimation.joint_state import BIASES, KNOT, LINE, LINE_SCALE
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.joint_verdict import Judged, judge_joint, known
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset_result import early_or_late
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
-from calibkit.geometry.spline import Steps, basis, turning
+from calibkit.geometry.spline import Steps, basis
 
 STAGE = "joint"
 _BIAS_DRAWS = 32  # of the state: a sigma is then known to 13 %
 
 
 def joint_result(
-    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imu: str, stamps: dict[str, StampReport]
+    joint: Joint,
+    trust: Trust,
+    checks: Checks,
+    cameras: Sequence[CameraInput],
+    imu: str,
+    of_imu: ImuInput,
+    stamps: dict[str, StampReport],
+    before: Imu | None = None,
 ) -> Result:
-    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera."""
+    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera; `before` is the rig file's entry of the IMU."""
     names = tuple(each.views.camera for each in cameras)
-    judged = judge_joint(joint, trust, checks, names, imu, stamps)
+    judged = judge_joint(joint, trust, checks, cameras, imu, of_imu, stamps)
     fit, border = joint.fit, joint.fit.problem.border
     rig = Rig()
     unknown: list[str] = []
@@ -60,7 +68,16 @@ def joint_result(
         rig.cameras[name] = _camera(joint, trust, judged, each, c)
         unknown += [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
         unknown += [f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else []
-        unknown += [f"{name}.{key}" for key, value in rig.cameras[name].parameters.items() if value.status is Status.NOT_OBSERVABLE]
+        lens = rig.cameras[name]
+        unknown += [f"{name}.{key}" for key, value in lens.parameters.items() if value.status is Status.NOT_OBSERVABLE]
+        unknown += [f"{name}.line_delay"] if lens.line_delay is not None and lens.line_delay.value is None else []
+    before = before or Imu(rate_hz=round(joint.rate_hz, 3))
+    if of_imu.extras:
+        entry_of_imu = intrinsics_of(fit, trust, of_imu, fit.problem.gravity.size)
+        judgement = {"verdict": judged.verdict(imu), "reasons": judged.texts(imu)}
+        before = before.model_copy(update={"intrinsics": entry_of_imu.model_copy(update=judgement)})
+        unknown += [f"{imu}.{key}" for key, value in entry_of_imu.parameters.items() if value.status is Status.NOT_OBSERVABLE]
+    rig.imus[imu] = before
     residuals = [*(_corner_set(joint, cameras[c], c) for c in range(len(names))), *_imu_sets(joint, imu)]
     return Result(
         stage=STAGE,
@@ -86,24 +103,39 @@ def _estimate(value: float, unit: str, trust: Trust, k: int, status: Status) -> 
     return Estimate(value=float(value), unit=unit, sigma=sigma, sigma_plain=plain, status=status)
 
 
-def _camera(joint: Joint, trust: Trust, judged: Judged, each: CameraInput, c: int) -> Camera:
-    fit, name = joint.fit, each.views.camera
-    where = fit.problem.border[f"lens {c}"]
-    model = fit.problem.cameras[c].views.model
+def _lens(joint: Joint, trust: Trust, judged: Judged, c: int) -> dict[str, object]:
+    """Return what was found of camera c's lens and shutter."""
+    fit, border = joint.fit, joint.fit.problem.border
+    where, names = border[f"lens {c}"], fit.problem.cameras[c].views.model.parameter_names
     parameters = {
         p: _estimate(fit.x.cameras[c].lens[i], "px" if i < 4 else "", trust, where.start + i, judged.statuses[where.start + i])
-        for i, p in enumerate(model.parameter_names)
+        for i, p in enumerate(names)
     }
     every = all(value.value is not None for value in parameters.values())
+    return {"parameters": parameters, "covariance": make_covariance(names, trust.cov[where, where]) if every else None}
+
+
+def _line_delay(joint: Joint, trust: Trust, judged: Judged, c: int) -> Estimate:
+    k = joint.fit.problem.border[f"{LINE} {c}"].start
+    if judged.statuses[k] is Status.NOT_OBSERVABLE:
+        return Estimate(value=None, unit="s", status=Status.NOT_OBSERVABLE)
+    sigma, plain = (LINE_SCALE * float(np.sqrt(cov[k, k])) for cov in (trust.cov, trust.covariance.plain))
+    return Estimate(value=joint.fit.x.cameras[c].line_delay, unit="s", sigma=sigma, sigma_plain=plain, status=judged.statuses[k])
+
+
+def _camera(joint: Joint, trust: Trust, judged: Judged, each: CameraInput, c: int) -> Camera:
+    fit, name = joint.fit, each.views.camera
+    found = {} if each.lens_given else _lens(joint, trust, judged, c)
+    if LINE in fit.problem.extras:
+        found["line_delay"] = _line_delay(joint, trust, judged, c)
     px, valid = corner_residuals(fit.problem, fit.x, c)
-    kept, found = fit.problem.cameras[c].views.weight > 0, fit.found[c] & valid
+    kept, seen = fit.problem.cameras[c].views.weight > 0, fit.found[c] & valid
     return each.camera.model_copy(
         update={
-            "parameters": parameters,
-            "covariance": make_covariance(model.parameter_names, trust.cov[where, where]) if every else None,
+            **found,
             "reprojection": Reprojection(
                 rms_px=_rms(px[kept]),
-                rms_all_px=_rms(px[found]),
+                rms_all_px=_rms(px[seen]),
                 held_out_rms_px=None,
                 corners=int(kept.sum()),
                 corners_dropped=int(fit.found[c].sum() - kept.sum()),
@@ -122,12 +154,11 @@ def _rms(px: Array) -> float:
 
 def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
     """Return every corner's residual with the rate of turn and where the board was."""
-    fit, frames, camera = joint.fit, joint.fit.problem.cameras[c], joint.fit.x.cameras[c]
+    fit, frames = joint.fit, joint.fit.problem.cameras[c]
     px, valid = corner_residuals(fit.problem, fit.x, c)
     frame, corner = np.nonzero(fit.found[c])
-    T = poses_of_board(fit.problem, fit.x, c)
-    i, u = fit.problem.knots.locate(frames.t + camera.dt)
-    at = turning(fit.x.R, Steps.of(fit.x.R), i, basis(fit.problem.knots, u), basis(fit.problem.knots, u, 1), jacobians=False)
+    seen = fit.problem.seen(fit.x, Steps.of(fit.x.R), c)
+    T = seen.T_cam_board
     points = se3.transform(T, fit.problem.points)
     weight = frames.views.weight[frame, corner]
     usual = float(np.median(weight[weight > 0])) if np.any(weight > 0) else 1.0
@@ -144,7 +175,7 @@ def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
             "kept": weight > 0,
             "distance": np.linalg.norm(points, axis=-1)[frame, corner],
             "tilt": np.arccos(np.clip(np.abs(T[:, 2, 2]), 0, 1))[frame],
-            "rate": np.linalg.norm(at.omega, axis=1)[frame],
+            "rate": np.linalg.norm(seen.at.omega, axis=1)[frame],
         },
     )
 

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
-from calibkit.models.imu import ImuModel, lower
+from calibkit.models.imu import ACCEL_PARAMETERS, GYRO_PARAMETERS, SENSITIVITY_PARAMETERS, ImuModel, lower
 
 KNOT = 12  # unknowns of a knot: rotation, position, gyroscope's bias, accelerometer's bias
 ROTATION, POSITION, BIASES = slice(0, 3), slice(3, 6), slice(6, 12)
@@ -38,6 +39,7 @@ class JointState:
 # What is free on request, and what is suspected where it is not: names with the number of unknowns.
 SCALE, M_A, M_G, PHI, A_G, LINE = "board scale", "M_a", "M_g", "phi_g_i", "A_g", "line delay"
 EXTRAS = {SCALE: 1, M_A: 6, M_G: 6, PHI: 3, A_G: 9, LINE: 1}
+IMU_MODEL = {M_A: ACCEL_PARAMETERS[:6], M_G: GYRO_PARAMETERS[:6], PHI: GYRO_PARAMETERS[6:9], A_G: SENSITIVITY_PARAMETERS}
 LINE_SCALE = 1e-3  # the unknown of a line delay is its delay of a thousand rows
 
 
@@ -66,6 +68,11 @@ class Border:
         """Return T_cam_imu (rho, phi), dt, lens and line delay of camera c."""
         last = f"{LINE if LINE in self.extras else 'lens'} {c}"
         return slice(self[f"T {c}"].start, self[last].stop)
+
+    @property
+    def of_model(self) -> NDArray[np.int64]:
+        """Return where what is free of the IMU's model stands, in the order of IMU_MODEL."""
+        return np.array([k for name in IMU_MODEL if name in self.extras for k in range(self[name].start, self[name].stop)], np.int64)
 
     @property
     def of_imu(self) -> slice:
@@ -109,6 +116,17 @@ def retract(x: JointState, where: Border, core: Array, border: Array) -> JointSt
         board_scale=x.board_scale + float(moved.get(SCALE, _NO_3)[0]),
         imu=imu,
     )
+
+
+def model_step(a: ImuModel, b: ImuModel) -> dict[str, Array]:
+    """Return the step from model a to model b by the names of IMU_MODEL."""
+    rows, columns = np.tril_indices(3)
+    return {
+        M_A: (b.M_a - a.M_a)[rows, columns],
+        M_G: (b.M_g - a.M_g)[rows, columns],
+        PHI: so3.log(a.C_g_i.T @ b.C_g_i),
+        A_G: (b.A_g - a.A_g).ravel(),
+    }
 
 
 _NO_3, _NO_6, _NO_9 = np.zeros(3), np.zeros(6), np.zeros(9)

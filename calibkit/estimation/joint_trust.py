@@ -8,16 +8,25 @@ from threadpoolctl import threadpool_limits
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import schur
 from calibkit.estimation.joint_parts import projected
-from calibkit.estimation.joint_state import LINE, LINE_SCALE
+from calibkit.estimation.joint_state import A_G, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE
 from calibkit.estimation.lens_fit import rows_of
 from calibkit.estimation.lens_trust import biased, lens_scales
 from calibkit.estimation.open_directions import TRANSFORM_SCALES
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Steps
+from calibkit.models.imu import STANDARD_GRAVITY
 from calibkit.solver.banded import Banded
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
+BIAS_SCALES = (1e-3, 1e-3 * STANDARD_GRAVITY.value)  # rad/s, m/s^2: what a gyroscope's and an accelerometer's must be known to
 _GRAVITY_SCALE = 0.01  # m/s^2: 1 mrad of its direction
+EXTRA_SCALES = {
+    SCALE: SCALES[""],
+    M_A: SCALES[""],
+    M_G: SCALES[""],
+    PHI: SCALES["rad"],
+    A_G: BIAS_SCALES[0] / STANDARD_GRAVITY.value,  # as much as a bias, at 1 g
+}
 _BIAS_FRAMES = 40
 _KNOWN_AT_LEAST = 1e-3  # of a direction's information is not noise's: one draw of it does not tell less from none
 
@@ -111,7 +120,7 @@ def border_scales(fit: JointFit) -> Array:
     scales = np.empty(border.size)
     scales[border["gravity"]] = _GRAVITY_SCALE
     for name in set(fit.problem.extras) - {LINE}:
-        scales[border[name]] = SCALES[""]
+        scales[border[name]] = EXTRA_SCALES[name]
     for c, (frames, camera) in enumerate(zip(fit.problem.cameras, fit.x.cameras, strict=True)):
         scales[border[f"T {c}"]] = TRANSFORM_SCALES
         scales[border[f"dt {c}"]] = SCALES["s"]

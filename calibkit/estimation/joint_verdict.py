@@ -1,15 +1,18 @@
 """What the joint estimate is worth: what the motion left open and would mend, and what speaks against the data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
-from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_causes import WORDS, jittering, wrong_sensors
 from calibkit.estimation.joint_checks import Checks
+from calibkit.estimation.joint_imu import ImuInput
 from calibkit.estimation.joint_seed import STAMPS
+from calibkit.estimation.joint_state import A_G, IMU_MODEL, LINE, M_A, M_G, PHI
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
 from calibkit.estimation.stamps import StampReport
@@ -24,6 +27,14 @@ _SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
 _HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
 _MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
 _OTHER_CLOCK_S, _GAP_S = 1.0, 0.9
+_READOUT_S = 5e-4  # of an image: less costs 0.25 px at the first and the last row at a fast 1 rad/s
+_ODD_SCALE = 1.25  # a scale farther from 1 is no sensor's error
+_IMU_MENDS = {
+    M_A: "turn the rig onto each of its sides, and shake it along all axes",
+    M_G: "turn the rig fast about all axes",
+    PHI: "turn the rig fast about all axes",
+    A_G: "shake the rig along all axes, and turn it onto each of its sides",
+}
 
 
 @dataclass(frozen=True)
@@ -45,9 +56,11 @@ class Judged:
         return [reason.text.removeprefix(f"{entry}: ") for reason in self.reasons.get(entry, ())]
 
 
-def judge_joint(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str, stamps: dict[str, StampReport]) -> Judged:
-    """Return what is known of cameras `names` and of `imu`."""
-    fit = joint.fit
+def judge_joint(
+    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imu: str, of_imu: ImuInput, stamps: dict[str, StampReport]
+) -> Judged:
+    """Return what is known of the cameras and of `imu`."""
+    fit, names = joint.fit, tuple(each.views.camera for each in cameras)
     border = fit.problem.border
     sigma = np.sqrt(np.diag(trust.cov)) / trust.scales
     statuses = [Status(grade(s)) for s in sigma]
@@ -64,15 +77,19 @@ def judge_joint(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ..
         size = f"its sigma would be {sigma[k] * trust.scales[k] * 1e3:.2g} ms"
         known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
         reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
+        rolls = _of_shutter(joint, checks, name, c)
         judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
         if statuses[k] is not Status.NOT_OBSERVABLE:
-            reasons[dt] += (*_of_offset(joint, c, dt, name, imu), *judged.others)
-        cause = jitter[c]  # what follows from it is not told
-        reasons[name] = (*_of_lens(joint, trust, names, c), *(_of_corners(joint, names, c) if cause is None else (cause,)))
+            turns = () if rolls or fit.x.cameras[c].line_delay else judged.turns  # which know nothing of a shutter
+            reasons[dt] += (*_of_offset(joint, c, dt, name, imu), *judged.clock, *turns, *judged.stamps)
+        cause = jitter[c]  # what follows from it, or from a shutter, is not told
+        corners = rolls or (_of_corners(joint, names, c) if cause is None else (cause,))
+        reasons[name] = (*_of_lens(joint, trust, cameras[c], c), *corners)
         if cause is not None:
             reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
+    reasons[imu] = _of_imu(joint, statuses, imu, of_imu)
     reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter))
-    reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, names))}
+    reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, (*names, imu)))}
     return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
 
 
@@ -100,9 +117,36 @@ def _open_text(each: Open) -> str:
     return f"{each.text} is {cause}: {mend}"
 
 
-def _of_lens(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:
-    fit, name = joint.fit, names[c]
-    where = fit.problem.border[f"lens {c}"]
+def _of_imu(joint: Joint, statuses: Sequence[Status], imu: str, known: ImuInput) -> tuple[Reason, ...]:
+    """Return what is not known of the IMU's model, and a scale that is another unit's."""
+    border, found = joint.fit.problem.border, []
+    if known.given:
+        text = f"{imu}: its scale and axes are held as given without a covariance: the sigmas of T and dt hold none of their errors"
+        found.append(Reason(Verdict.CHECK, text))
+    for status in (Status.NOT_OBSERVABLE, Status.WEAK):
+        for extra, mend in _IMU_MENDS.items():
+            if extra not in border.extras:
+                continue
+            where = border[extra]
+            those = [key for key, s in zip(IMU_MODEL[extra], statuses[where], strict=True) if s is status]
+            if those:
+                be = "is" if len(those) == 1 else "are"
+                found.append(Reason(_VERDICTS[status], f"{imu}: {', '.join(those)} {be} {status.value}: {mend}"))
+    model = joint.fit.x.imu
+    for extra, M in ((M_A, model.M_a), (M_G, model.M_g)):
+        scale = float(np.median(np.diag(M)))
+        if extra in border.extras and not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+            sensor = WORDS["accel" if extra == M_A else "gyro"]
+            found.append(Reason(Verdict.FAIL, f"{imu}: the {sensor}'s scale is {scale:.4g}, not about 1: another unit, or raw counts?"))
+    return tuple(found)
+
+
+def _of_lens(joint: Joint, trust: Trust, camera: CameraInput, c: int) -> tuple[Reason, ...]:
+    fit, name, border = joint.fit, camera.views.camera, joint.fit.problem.border
+    if camera.lens_given:
+        text = f"{name}: its lens is held as given without a covariance: the sigmas of T and dt hold none of its error"
+        return (Reason(Verdict.CHECK, text),)
+    where = border[f"lens {c}"]
     model = fit.problem.cameras[c].views.model
     sigma = (np.sqrt(np.diag(trust.cov)) / trust.scales)[where]
     found = []
@@ -113,7 +157,27 @@ def _of_lens(joint: Joint, trust: Trust, names: tuple[str, ...], c: int) -> tupl
             found.append(
                 Reason(_VERDICTS[status], f"{name}: {', '.join(those)} {'is' if len(those) == 1 else 'are'} {status.value}: {mend}")
             )
+    if LINE in border.extras:
+        k = border[f"{LINE} {c}"].start
+        status = Status(grade(float(np.sqrt(trust.cov[k, k]) / trust.scales[k])))
+        if status is not Status.DETERMINED:
+            found.append(
+                Reason(_VERDICTS[status], f"{name}: its line delay is {status.value}: turn faster, the board over the whole image")
+            )
     return tuple(found)
+
+
+def _of_shutter(joint: Joint, checks: Checks, name: str, c: int) -> tuple[Reason, ...]:
+    """Return that a camera whose rows are taken to be read at once reads them one by one."""
+    asked = checks.line_delays[c]
+    if asked is None:
+        return ()
+    delay, sigma = asked
+    readout = delay * joint.fit.problem.cameras[c].views.image_size[1]
+    if abs(readout) < _READOUT_S or abs(delay) < _SURE * sigma:
+        return ()
+    rows = f"{delay * 1e6:.3g} +- {sigma * 1e6:.2g} us a row, {abs(readout) * 1e3:.2g} ms an image"
+    return (Reason(Verdict.CHECK, f"{name}: its rows seem to be read one after the other, {rows}: a rolling shutter? Add --line-delay"),)
 
 
 def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, ...]:

@@ -153,7 +153,7 @@ def _told_by(slow: PoseStream, fast: PoseStream, read_P: bool, progress: Progres
         offset = ClockOffset(fit.td if read_P else -fit.td, fit.sigma, "turns", fit, judged.fast)
         return _Told(offset, "", tuple(reason for reason in judged.reasons if reason is not judged.size))
     assert judged.size is not None
-    return _Told(None, judged.size.text.removeprefix(f"{name}: not observable: "), judged.others)
+    return _Told(None, judged.size.text.removeprefix(f"{name}: not observable: "), (*judged.clock, *judged.turns, *judged.stamps))
 
 
 def _fit(slow: PoseStream, fast: PoseStream, progress: Progress) -> TimeOffsetFit:

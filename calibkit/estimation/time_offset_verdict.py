@@ -36,12 +36,14 @@ class Judged:
     status: Status
     size: Reason | None  # why it is weak or not observable
     fast: Reason | None  # that fast and slow motion disagree
-    others: tuple[Reason, ...]
+    clock: tuple[Reason, ...]  # that it is not one number
+    turns: tuple[Reason, ...]  # what else their residuals say
+    stamps: tuple[Reason, ...]
     coarse: bool = False  # not observable only for its sigma: still a start for what else tells it
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        return (*(reason for reason in (self.size, self.fast) if reason is not None), *self.others)
+        return (*(reason for reason in (self.size, self.fast) if reason is not None), *self.clock, *self.turns, *self.stamps)
 
 
 def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: dict[str, StampReport]) -> Judged:
@@ -59,15 +61,20 @@ def judge_time_offset(name: str, of: str, to: str, fit: TimeOffsetFit, stamps: d
     if why:
         wrong = [text for verdict, text in sizes if verdict is Verdict.FAIL]  # what makes a fit bad is the reason, and no lack of motion
         size = Reason(Verdict.FAIL, f"{name}: not observable: {wrong[0] if wrong else why}")
-        return Judged(Status.NOT_OBSERVABLE, size, None, spoilt, coarse)
+        return Judged(Status.NOT_OBSERVABLE, size, None, (), (), spoilt, coarse)
     weak = f"{name}: weak: known to {fit.sigma * 1e3:.2g} ms only; {_advice(fit)}"
     frame_hz, to_hz = (stamps[sensor].rate_hz if sensor in stamps else None for sensor in (of, to))
-    doubts = (*_doubts(of, to, fit, frame_hz), *sizes, *_sparse(of, to, frame_hz, to_hz))
+    clock, turns = (
+        tuple(Reason(verdict, f"{name}: {text}") for verdict, text in found)
+        for found in (_of_clock(to, fit, frame_hz), [*_doubts(of, to, fit), *sizes, *_sparse(of, to, frame_hz, to_hz)])
+    )
     return Judged(
         known,
         Reason(Verdict.CHECK, weak) if known is Status.WEAK else None,
         _fast_and_slow(name, of, to, fit),
-        (*(Reason(verdict, f"{name}: {text}") for verdict, text in doubts), *spoilt),
+        clock,
+        turns,
+        spoilt,
     )
 
 
@@ -141,12 +148,16 @@ def _advice(fit: TimeOffsetFit) -> str:
     )
 
 
-def _doubts(of: str, to: str, fit: TimeOffsetFit, frame_hz: float | None) -> list[tuple[Verdict, str]]:
-    found = []
+def _of_clock(to: str, fit: TimeOffsetFit, frame_hz: float | None) -> list[tuple[Verdict, str]]:
     clock = fit.clock
-    if clock is not None and clock.kind != "constant":
-        verdict = Verdict.FAIL if clock.jumps else Verdict.CHECK
-        found += [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, to, frame_hz)]
+    if clock is None or clock.kind == "constant":
+        return []
+    verdict = Verdict.FAIL if clock.jumps else Verdict.CHECK
+    return [(verdict, f"{text}; one number does not hold throughout") for text in describe(clock, to, frame_hz)]
+
+
+def _doubts(of: str, to: str, fit: TimeOffsetFit) -> list[tuple[Verdict, str]]:
+    found = []
     if fit.alignment.levels.jitter > _JITTER_S**2:
         jitter = float(np.sqrt(fit.alignment.levels.jitter)) * 1e3
         text = f"the residuals of {of} grow with the rate as if its stamps jittered by {jitter:.2g} ms"

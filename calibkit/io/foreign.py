@@ -188,6 +188,8 @@ def without_place(rig: Rig, *sections: str) -> list[str]:
         lost.insert(0, "sigmas and covariances")
     if "imus" not in sections and any(imu.noise for imu in rig.imus.values()):
         lost.append("the noise of each axis")
+    if "cameras" not in sections and (rolling := [name for name, camera in rig.cameras.items() if camera.line_delay is not None]):
+        lost.append(f"the line delay of {', '.join(rolling)}")
     return [f"not written, the format has no place for them: {', '.join(lost)}"] if lost else []
 
 

@@ -77,7 +77,10 @@ def parts(rig: Rig) -> list[tuple[str, Camera | Transform | TimeOffset | Imu | I
 
 def rows(rig: Rig) -> list[Row]:
     """Return all parameters of the rig: cameras, transforms, time offsets, IMUs."""
-    out = [_row(name, key, estimate) for name, camera in rig.cameras.items() for key, estimate in camera.parameters.items()]
+    out = []
+    for name, camera in rig.cameras.items():
+        out += [_row(name, key, estimate) for key, estimate in camera.parameters.items()]
+        out += [_row(name, "line_delay", camera.line_delay)] if camera.line_delay is not None else []
     for name, transform in rig.transforms.items():
         out += _transform_rows(name, transform)
     out += [_row(name, "offset", entry.offset, entry.equation) for name, entry in rig.time_offsets.items()]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,19 +14,22 @@ from calibkit.data.rig import Camera, Imu, Rig
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.joint import CameraInput, ImuNoise, Settings, calibrate_joint
 from calibkit.estimation.joint_checks import check_joint
+from calibkit.estimation.joint_imu import imu_input
 from calibkit.estimation.joint_problem import GravityPrior
 from calibkit.estimation.joint_result import joint_result
+from calibkit.estimation.joint_state import A_G, LINE, M_A, M_G, PHI
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.estimation.stamps import check_stamps
-from calibkit.geometry.so3 import Array
 from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.target_file import load_target
-from calibkit.models.imu import STANDARD_GRAVITY, Gravity, ImuModel
+from calibkit.models.imu import STANDARD_GRAVITY, Gravity
 from calibkit.stages.intrinsics import Options as LensOptions
 from calibkit.stages.intrinsics import name_cameras, observe
 from calibkit.stages.outputs import Outputs, Saved, save
 
+ImuModelChoice = Literal["known", "scale-misalignment"]
+_IMU_EXTRAS: dict[str, tuple[str, ...]] = {"known": (), "scale-misalignment": (M_A, M_G, PHI)}
 _DEFAULT = ImuOptions()
 _IN_G = (0.7, 1.4)  # median |a|
 _IMU_NAME = "imu0"
@@ -42,6 +46,9 @@ class Options:
     gravity: Gravity = STANDARD_GRAVITY
     knots_s: float | None = None
     hold_lens: bool = False  # as the rig file has it, with its covariance
+    imu_model: ImuModelChoice = "known"
+    g_sensitivity: bool = False  # of the gyroscope, free
+    line_delay: bool = False  # of rolling shutters, free
     halves: bool = True
     cache: bool = True
     ros_distro: str | None = None
@@ -62,26 +69,33 @@ def joint(
     name, topic = name_imu(recording, base, options.imu)
     lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
     samples = recording.imu(topic, progress)
-    samples = _corrected(samples, base.imus.get(name), name)
+    known = base.imus.get(name) or Imu(topic=one_line(topic))
+    of_imu = imu_input(name, samples, known.intrinsics, _IMU_EXTRAS[options.imu_model] + ((A_G,) if options.g_sensitivity else ()))
+    samples = of_imu.samples
     _refuse_imu(samples, name, topic)
     resolution = next(iter(lenses.values())).resolution
     views = observe(recording, topics, board, LensOptions(resolution=resolution, cache=options.cache), progress)
-    cameras = [CameraInput(each, lenses[each.camera], _held(lenses[each.camera]) if options.hold_lens else None) for each in views]
-    settings = Settings(GravityPrior(options.gravity.value, max(options.gravity.sigma, _GRAVITY_SIGMA)), options.knots_s)
+    cameras = [_input(each, lenses[each.camera], options.hold_lens) for each in views]
+    extras = (*of_imu.extras, *((LINE,) if options.line_delay else ()))
+    gravity = GravityPrior(options.gravity.value, max(options.gravity.sigma, _GRAVITY_SIGMA))
+    settings = Settings(gravity, options.knots_s, of_imu.model, of_imu.information, extras)
     try:
-        found = calibrate_joint(cameras, samples, _noise(base.imus.get(name)), settings, progress)
+        found = calibrate_joint(cameras, samples, _noise(known), settings, progress)
     except BadInputError as error:
         damaged = "".join(f" ({text})" for text in recording.warnings)  # what was not read may be why
         raise BadInputError(f"{recording.name}: {', '.join(topics)} and {name}: {error}{damaged}") from None
     trust, checks = joint_trust(found.fit), check_joint(found.fit, options.halves)
     stamps = {name: check_stamps(samples.t_ns, "sample"), **{each.camera: check_stamps(each.t_ns, "frame") for each in views}}
-    result = joint_result(found, trust, checks, cameras, name, stamps)
-    rig = result.rig.model_copy(update={"imus": {name: _imu(base.imus.get(name), topic, found.rate_hz)}})
-    result = replace(result, rig=rig, facts={**result.facts, "warnings": [*recording.warnings, *_warnings(views)]})
+    known = known if name in base.imus else known.model_copy(update={"rate_hz": round(found.rate_hz, 3)})
+    result = joint_result(found, trust, checks, cameras, name, of_imu, stamps, known)
+    result = replace(result, facts={**result.facts, "warnings": [*recording.warnings, *_warnings(views)]})
     told: dict[str, str | float | int | bool | None] = {
         "target": board.key(),
         "imu": f"{name}={one_line(topic)}",
         "hold_lens": options.hold_lens,
+        "imu_model": options.imu_model,
+        "g_sensitivity": options.g_sensitivity,
+        "line_delay": options.line_delay,
         "knots_s": options.knots_s,
     }
     read = [*outputs.rigs, target]
@@ -119,27 +133,14 @@ def _lens(base: Rig, name: str, topic: str) -> Camera:
     return camera
 
 
-def _held(camera: Camera) -> tuple[Array, Array]:
-    """Return the lens of the rig file with its information; one without a covariance is taken as good as certain."""
+def _input(views: BoardViews, camera: Camera, held: bool) -> CameraInput:
+    """Return what enters the fit; a lens that is held without a covariance is taken as good as certain."""
+    if not held:
+        return CameraInput(views, camera)
     lens = np.array([value.value for value in camera.parameters.values()], float)
     if camera.covariance is None:
-        return lens, np.diag(1 / (1e-6 * np.maximum(np.abs(lens), 1e-3)) ** 2)
-    return lens, np.linalg.inv(np.array(camera.covariance.matrix))
-
-
-def _corrected(samples: ImuSamples, imu: Imu | None, name: str) -> ImuSamples:
-    """Return the samples as the rig file's scale, axes and biases have them: a_i and w_i in SI."""
-    if imu is None or imu.intrinsics is None or not (samples.has_gyro and samples.has_accel):
-        return samples
-    values = {key: value.value for key, value in imu.intrinsics.parameters.items() if value.value is not None}
-    if missing := sorted(imu.intrinsics.parameters.keys() - values.keys()):
-        raise BadInputError(
-            f"{name}: {', '.join(missing)} of its intrinsics are not known: leave them out of the rig file, or calibrate it"
-        )
-    if samples.unit != imu.intrinsics.unit:
-        raise BadInputError(f"{name}: its samples are in {samples.unit}, its intrinsics in the rig file for {imu.intrinsics.unit}")
-    accel, gyro = ImuModel.of(values).correct(samples.accel, samples.gyro)
-    return replace(samples, accel=accel, gyro=gyro, unit="SI")
+        return CameraInput(views, camera, (lens, np.diag(1 / (1e-6 * np.maximum(np.abs(lens), 1e-3)) ** 2)), lens_given=True)
+    return CameraInput(views, camera, (lens, np.linalg.inv(np.array(camera.covariance.matrix))))
 
 
 def _refuse_imu(samples: ImuSamples, name: str, topic: str) -> None:
@@ -154,12 +155,6 @@ def _refuse_imu(samples: ImuSamples, name: str, topic: str) -> None:
         raise BadInputError(f"{where}: its accelerometer reads {size:.3g} in the middle: it is in g; say --accel-unit g")
 
 
-def _noise(imu: Imu | None) -> ImuNoise:
-    if imu is None:
-        return ImuNoise()
+def _noise(imu: Imu) -> ImuNoise:
     known = (imu.gyro_noise_density, imu.gyro_random_walk, imu.accel_noise_density, imu.accel_random_walk)
     return ImuNoise(*(None if each is None or not each.value else each.value for each in known))
-
-
-def _imu(known: Imu | None, topic: str, rate_hz: float) -> Imu:
-    return known if known is not None else Imu(topic=one_line(topic), rate_hz=round(rate_hz, 3))

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from calibkit.estimation.camera_problem import CameraProblem, CameraViews
 from calibkit.estimation.lens_fit import LensFit, instant_times, part_of
-from calibkit.geometry.so3 import Array, hat
-from calibkit.models.cameras import CameraModel
+from calibkit.estimation.pixel_grid import GRID, grid, turned_jacobian
+from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import SCALES, Covariance, covariance_in_time
 
 _SAME_ORIENTATION = np.deg2rad(5.0)
 _OUTERMOST = 99.0  # percentile of an effect over the corners: at the outermost, but for a stray one
-_GRID = (24, 16)
 _BIAS_INSTANTS = 60
 _BIAS_PATCHES = (4, 3)
 
@@ -163,22 +162,15 @@ def projection_sigma(views: CameraViews, lens: Array, cov_lens: Array) -> Projec
 
     du = J dlens + J_R phi, with phi the common rotation that best absorbs the first over the observed part of the image.
     """
-    model: CameraModel = views.model
     width, height = views.image_size
-    x, y = np.meshgrid((np.arange(_GRID[0]) + 0.5) * width / _GRID[0] - 0.5, (np.arange(_GRID[1]) + 0.5) * height / _GRID[1] - 0.5)
-    uv = np.stack([x.ravel(), y.ravel()], axis=-1)
+    uv = grid(views.image_size)
     observed = views.uv[views.weight > 0]
-    cell = np.clip((observed + 0.5) / [width, height] * _GRID, 0, np.array(_GRID) - 1).astype(int)
-    seen = np.zeros(_GRID[::-1], bool)
+    cell = np.clip((observed + 0.5) / [width, height] * GRID, 0, np.array(GRID) - 1).astype(int)
+    seen = np.zeros(GRID[::-1], bool)
     seen[cell[:, 1], cell[:, 0]] = True
-    rays, valid = model.unproject(uv, lens)
-    projection = model.project(rays, lens, jacobians=True)
-    assert projection.J_params is not None
-    assert projection.J_point is not None
-    J, J_R = projection.J_params, -projection.J_point @ hat(rays)
+    rays, valid = views.model.unproject(uv, lens)
     fit_at = seen.ravel() & valid if (seen.ravel() & valid).any() else valid
-    absorb = np.linalg.lstsq(J_R[fit_at].reshape(-1, 3), -J[fit_at].reshape(-1, J.shape[-1]), rcond=None)[0]
-    J = J + J_R @ absorb
+    J = turned_jacobian(views.model, lens, rays, fit_at)
     cov = J @ cov_lens @ np.swapaxes(J, -1, -2)
     sigma = np.full(len(uv), np.nan)
     sigma[valid] = np.sqrt(np.maximum(np.linalg.eigvalsh(cov[valid])[:, -1], 0))

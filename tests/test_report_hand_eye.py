@@ -66,10 +66,10 @@ def poses_of(result: Result) -> View:
 
 
 def test_all_pictures_are_drawn_and_the_same_each_time(good: Result) -> None:
-    again = {f"{NAME}-handeye-{one.picture.key}.png": one.png for view in views(good) for one in draw(view)}
+    again = {f"pictures/{NAME}-handeye-{one.picture.key}.png": one.files["png"] for view in views(good) for one in draw(view, ["png"])}
     page = build(summarise(good.rig, [replace(good, facts={**good.facts, "tables": [*good.facts["tables"], [["<b>"]]]})]))
     assert b"<th>&lt;b&gt;</th>" in page["report.html"]
-    assert {f"{NAME}-handeye-{key}.png" for key in KEYS} == again.keys()
+    assert {f"pictures/{NAME}-handeye-{key}.png" for key in KEYS} == again.keys()
     assert all(page[key] == png for key, png in again.items())
     assert b"im_04.png" in page["report.html"]
     assert b"<td>daniilidis</td>" in page["report.html"]

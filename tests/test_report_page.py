@@ -58,9 +58,10 @@ def test_one_page_that_needs_nothing_from_outside():
     assert not re.search(r"@import|url\(", html)
     assert len(files["report.html"]) < 3e6
     assert sorted(files) == [
-        *(f"cam0-intrinsics-{key}.png" for key in ("coverage", "field", "frames", "scatter")),
+        *(f"pictures/cam0-intrinsics-{key}.png" for key in ("coverage", "field", "frames", "scatter")),
         "report.html",
         "report.json",
+        "report.md",
     ]
     assert html.index("Parameters") < html.index("Signals") < html.index("Residual scatter") < html.index("Worst frames")
     assert "<title>PASS · intrinsics of rig.bag · calibkit report</title>" in html
@@ -93,7 +94,7 @@ def test_the_schema_is_stable():
     data = json.loads(pages(result(residuals=residual_set(frames=6), thumbnails=0))["report.json"])
     assert data["schema"] == "calibkit-report/1"
     assert list(data) == [
-        "schema", "verdict", "reasons", "not_observable", "parameters", "signals", "frames", "facts", "pictures", "provenance",
+        "schema", "verdict", "reasons", "limits", "not_observable", "parameters", "signals", "frames", "facts", "pictures", "provenance",
     ]  # fmt: skip
     assert data["parameters"][0] == {
         "part": "cam0", "name": "fx", "value": 460.0, "sigma": 0.045, "sigma_plain": pytest.approx(0.045 / 1.7),
@@ -101,7 +102,7 @@ def test_the_schema_is_stable():
     }  # fmt: skip
     rms = data["signals"][0]
     assert (rms["key"], rms["unit"], rms["good"], rms["fail"], rms["smaller_is_better"]) == ("reprojection_rms", "px", 0.3, 1.0, True)
-    assert {"file": "cam0-intrinsics-field.png", "sensor": "cam0", "key": "field"}.items() <= data["pictures"][1].items()
+    assert {"file": "pictures/cam0-intrinsics-field.png", "sensor": "cam0", "key": "field"}.items() <= data["pictures"][1].items()
     assert len(data["frames"]) == 6
     assert json.dumps(data, allow_nan=False)
 

@@ -15,7 +15,7 @@ from calibkit.errors import BadInputError
 from calibkit.io.residual_file import save_residuals
 from calibkit.io.rig_file import save_rig, updated
 from calibkit.stages.outputs import Outputs
-from calibkit.stages.report import report, write_report
+from calibkit.stages.report import Files, report, write_report
 
 
 def save(made, path):
@@ -52,8 +52,12 @@ def test_the_stage_and_the_rig_file_give_the_same_pages(tmp_path, small):
     assert got.exit_code == 0, got.output
     assert got.output.splitlines()[-2].startswith("report: ")
     write_report(type(small)(**{**small.__dict__, "rig": rig}), tmp_path / "at_once")
-    for path in (tmp_path / "later").iterdir():
-        assert path.read_bytes() == (tmp_path / "at_once" / path.name).read_bytes(), path.name
+    later, at_once = (
+        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.*")}
+        for folder in (tmp_path / "later", tmp_path / "at_once")
+    )
+    assert later == at_once
+    assert {"report.html", "report.json", "report.md", "pictures/cam0-intrinsics-field.png"} <= later.keys()
     asked, paged = (json.loads(path.read_text()) for path in (tmp_path / "verdict.json", tmp_path / "later" / "report.json"))
     assert {**paged, "pictures": []} == asked
 
@@ -94,7 +98,7 @@ def test_a_missing_file_is_exit_code_2_and_writes_nothing(tmp_path, small):
     (tmp_path / "rig.intrinsics.residuals.npz").unlink()
     for rig in ("rig.yaml", "other.yaml"):
         with pytest.raises(BadInputError, match="rig.intrinsics.residuals.npz" if rig == "rig.yaml" else "other.yaml"):
-            report(tmp_path / rig, tmp_path / "out", tmp_path / "out.json")
+            report(tmp_path / rig, Files(tmp_path / "out", tmp_path / "out.json", tmp_path / "out.md", tmp_path / "out.xml"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml"]
 
 
@@ -132,16 +136,16 @@ def test_residuals_of_an_entry_that_a_later_stage_made_anew_are_left_out(tmp_pat
 
 def test_an_existing_report_is_kept_unless_forced(tmp_path, small):
     save(small, tmp_path / "rig.yaml")
-    report(tmp_path / "rig.yaml", tmp_path / "out")
+    report(tmp_path / "rig.yaml", Files(tmp_path / "out"))
     page = tmp_path / "out" / "report.html"
     page.write_text("mine")
     with pytest.raises(BadInputError, match="--force"):
-        report(tmp_path / "rig.yaml", tmp_path / "out")
+        report(tmp_path / "rig.yaml", Files(tmp_path / "out"))
     assert page.read_text() == "mine"
-    report(tmp_path / "rig.yaml", tmp_path / "out", force=True)
+    report(tmp_path / "rig.yaml", Files(tmp_path / "out", force=True))
     assert page.read_text() != "mine"
     with pytest.raises(BadInputError, match="is a file"):
-        report(tmp_path / "rig.yaml", tmp_path / "rig.yaml")
+        report(tmp_path / "rig.yaml", Files(tmp_path / "rig.yaml"))
 
 
 def test_where_nothing_can_be_written_is_told_by_the_name_that_was_given(tmp_path, monkeypatch):

@@ -113,7 +113,7 @@ CASES = {
 
 def drawn_of(made):
     """Return the drawn pictures by key."""
-    return {one.picture.key: one for view in views(made) for one in draw(view)}
+    return {one.picture.key: one for view in views(made) for one in draw(view, ["png"])}
 
 
 def signals_of(made):
@@ -137,7 +137,7 @@ def test_each_case_has_its_four_pictures_twice_the_same(case):
     first, again = (drawn_of(result(**CASES[case])) for _ in range(2))
     assert set(first) == PICTURES_OF
     for key, one in first.items():
-        assert (one.svg, one.png) == (again[key].svg, again[key].png)
+        assert (one.svg, one.files) == (again[key].svg, again[key].files)
         assert len(one.svg) < 5e5
 
 
@@ -311,7 +311,7 @@ def test_one_section_of_the_page_holds_them_in_reading_order():
     assert html.count(f"<h2>{SENSOR} (timeoffset)</h2>") == 1
     titles = ["The V: cost", "Rotation rates before", "Residual against rotation", "Time offset over time"]
     assert sorted(html.index(f"<h3>{title}") for title in titles) == [html.index(f"<h3>{title}") for title in titles]
-    assert {name for name in files if name.endswith(".png")} == {f"{SENSOR}-timeoffset-{key}.png" for key in PICTURES_OF}
+    assert {name for name in files if name.endswith(".png")} == {f"pictures/{SENSOR}-timeoffset-{key}.png" for key in PICTURES_OF}
 
 
 def test_the_residual_file_keeps_every_column(tmp_path):

@@ -6,7 +6,7 @@ A new picture is one function (Figure, View) and one line in PICTURES. Dark on w
 import io
 import textwrap
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import floor, log10
 from typing import Any
@@ -59,15 +59,22 @@ class Drawn:
     picture: Picture
     view: View
     svg: bytes
-    png: bytes
+    files: Mapping[str, bytes]  # by format
 
 
-def draw(view: View) -> list[Drawn]:
+FORMATS: dict[str, dict[str, str | None]] = {  # and what keeps the time of the day out of each
+    "png": {"Software": "calibkit"},
+    "pdf": {"Creator": "calibkit", "Producer": "calibkit", "CreationDate": None},
+    "svg": {"Creator": "calibkit", "Date": None},
+}
+
+
+def draw(view: View, formats: Sequence[str] = ()) -> list[Drawn]:
     """Return every picture that the view has the data for, in the table's order; the same view gives the same bytes."""
-    return [_render(picture, view) for picture in PICTURES if view.has(picture.needs)]
+    return [_render(picture, view, formats) for picture in PICTURES if view.has(picture.needs)]
 
 
-def _render(picture: Picture, view: View) -> Drawn:
+def _render(picture: Picture, view: View, formats: Sequence[str]) -> Drawn:
     # From the defaults up: a user's own matplotlibrc would change the bytes. No backend is chosen: Figure draws on its own.
     defaults: dict[Any, Any] = {key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith("backend")}
     with matplotlib.rc_context(defaults | STYLE), warnings.catch_warnings():
@@ -76,10 +83,14 @@ def _render(picture: Picture, view: View) -> Drawn:
         picture.draw(figure, view)
         figure.draw_without_rendering()  # lay out once, not at each saving
         figure.set_layout_engine("none")
-        svg, png = io.BytesIO(), io.BytesIO()
-        figure.savefig(svg, format="svg", dpi=130, metadata={"Date": None, "Creator": "calibkit"})
-        figure.savefig(png, format="png", dpi=130, metadata={"Software": "calibkit"})
-    return Drawn(picture, view, svg.getvalue(), png.getvalue())
+        files = {form: _saved(figure, form) for form in dict.fromkeys(("svg", *formats))}
+    return Drawn(picture, view, files["svg"], {form: files[form] for form in formats})
+
+
+def _saved(figure: Figure, form: str) -> bytes:
+    out = io.BytesIO()
+    figure.savefig(out, format=form, dpi=130, metadata=FORMATS[form])
+    return out.getvalue()
 
 
 def _scatter(figure: Figure, view: View) -> None:

@@ -1,63 +1,53 @@
-"""The report's files: one self-contained HTML page, its pictures as PNG, and report.json; the same input gives the same bytes."""
+"""The report's files: one self-contained HTML page, its pictures, report.md and report.json; the same input gives the same bytes."""
 
 import base64
 import json
 import re
+from collections.abc import Sequence
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from calibkit.data.rig import CONVENTIONS
-from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
 from calibkit.report.figures import PICTURES, Picture, draw
+from calibkit.report.markdown import MEANING, markdown
 from calibkit.report.parameters import sigma_note
-from calibkit.report.summary import Summary, as_json, camera_lines, stage_lines, stage_tables
+from calibkit.report.summary import Summary, about, as_json, camera_lines, limit_cells, stage_lines, stage_tables
 from calibkit.report.view import View
 from calibkit.version import __version__
 
-MEANING = {
-    Verdict.PASS: "use it",
-    Verdict.CHECK: "usable, but read the reasons",
-    Verdict.FAIL: "do not use it",
-}
 
-
-def build(summary: Summary) -> dict[str, bytes]:
-    """Return the report's files by name: report.html, report.json and the pictures."""
+def build(summary: Summary, formats: Sequence[str] = ("png",)) -> dict[str, bytes]:
+    """Return the report's files by name: report.html, report.md, report.json and the pictures in these formats (FORMATS)."""
     sections: dict[str, tuple[View, list[tuple[Picture, Markup]]]] = {}  # a sensor's sets under one heading
     images, pictures = {}, []
     for view in (*summary.views, *summary.earlier):
-        drawn = draw(view)
+        drawn = draw(view, formats)
         for one in drawn:
-            name = _slug(view.sensor, view.stage, one.picture.key) + ".png"
-            images[name] = one.png
             what = {"sensor": view.sensor, "stage": view.stage, "key": one.picture.key, "caption": one.picture.caption}
-            pictures.append({"file": name, **what})
+            for form, content in one.files.items():
+                name = f"pictures/{_slug(view.sensor, view.stage, one.picture.key)}.{form}"
+                images[name] = content
+                pictures.append({"file": name, **what})
         sections.setdefault(view.name, (view, []))[1].extend((one.picture, _data_uri("image/svg+xml", one.svg)) for one in drawn)
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
         told=[*camera_lines(summary), *stage_lines(summary)],
         tables=stage_tables(summary),
+        limits=limit_cells(summary),
         meaning=MEANING[summary.verdict],
         sections=[(view, sorted(drawn, key=lambda pair: PICTURES.index(pair[0]))) for view, drawn in sections.values()],
         thumbnails=thumbnails,
         conventions=CONVENTIONS,
-        about=_about(summary),
+        about=about(summary),
         sigma_note=sigma_note(summary.rig),
         version=__version__,
     )
     data = json.dumps(as_json(summary, pictures), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    return {**images, "report.html": page.encode(), "report.json": data.encode()}  # in the order of writing: what points to others last
-
-
-def _about(summary: Summary) -> str:
-    """Return which stages of which inputs the page tells of."""
-    runs = summary.rig.provenance
-    stages = ", ".join(dict.fromkeys(run.stage for run in runs)) or "rig"
-    names = ", ".join(dict.fromkeys(file.name for run in runs for file in run.inputs))
-    return f"{stages} of {names}" if names else stages
+    texts = {"report.md": markdown(summary), "report.html": page.encode(), "report.json": data.encode()}
+    return {**images, **texts}  # in the order of writing: what points to others last
 
 
 def _template() -> Template:

@@ -8,8 +8,9 @@ from math import isfinite
 from calibkit.data.plural import counted
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig
-from calibkit.data.verdict import Reason, Verdict, worst
+from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.errors import one_line
+from calibkit.report.limits import Check, Limit, check, require_observable
 from calibkit.report.parameters import Row, parts, rig_reasons, rows, sigma_note
 from calibkit.report.probe import Signal
 from calibkit.report.signals import measure, not_good
@@ -29,6 +30,7 @@ class Summary:
     views: tuple[View, ...]
     signals: tuple[Signal, ...]
     earlier: tuple[View, ...] = ()  # of entries that a later stage has made anew without residuals of its own: to be looked at
+    limits: tuple[Check, ...] = ()  # what a person asked for
 
     @property
     def verdict(self) -> Verdict:
@@ -40,10 +42,21 @@ class Summary:
         return any(row.sigma_plain is not None for row in self.parameters)
 
 
-def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = ()) -> Summary:
+@dataclass(frozen=True)
+class Demands:
+    """What a person asks of a rig beyond calibkit's own verdict."""
+
+    limits: tuple[Limit, ...] = ()
+    require_observable: bool = False
+
+
+NOTHING = Demands()
+
+
+def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (), demands: Demands = NOTHING) -> Summary:
     """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once.
 
-    What `earlier` ones leave is looked at, not judged.
+    What `earlier` ones leave is looked at, not judged. BadInputError for a limit on what the rig does not have.
     """
     seen = tuple(view for result in results for view in views(result))
     signals = tuple(signal for view in seen for signal in measure(view))
@@ -53,6 +66,13 @@ def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (
     unsaid = [name for name in gone if not any(_says(reason, name) for reason in said)]
     said += tuple(Reason(Verdict.FAIL, f"not observable in this recording: {name}") for name in unsaid)
     said += not_good(signals)
+    parameters = tuple(rows(rig))
+    asked = check(demands.limits, parameters, signals)
+    asked += (require_observable(parameters),) if demands.require_observable else ()
+    said += tuple(one.reason for one in asked if not one.holds)
+    lost = [f"{row.part} {row.name}" for row in parameters if row.status is Status.NOT_OBSERVABLE]
+    if lost and worst(said) is not Verdict.FAIL:  # whatever its stage made of it
+        said += (Reason(Verdict.FAIL, f"not observable in this recording: {', '.join(lost)}"),)
     if not said:
         judged = any(entry.verdict for _, entry in parts(rig))
         text = "nothing speaks against it" if judged else "no stage of calibkit has judged this rig: its numbers were given, not estimated"
@@ -61,7 +81,7 @@ def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (
     unique = sorted(dict.fromkeys(said), key=lambda reason: -order.index(reason.verdict))
     drawn = {view.sensor for view in seen}
     old = tuple(view for result in earlier for view in views(result) if view.sensor not in drawn)
-    return Summary(rig, tuple(results), tuple(unique), tuple(rows(rig)), seen, signals, old)
+    return Summary(rig, tuple(results), tuple(unique), parameters, seen, signals, old, asked)
 
 
 def _says(reason: Reason, name: str) -> bool:
@@ -75,12 +95,13 @@ def text(summary: Summary) -> str:
     told = [*camera_lines(summary), *stage_lines(summary)]
     lines = [*told, ""] if told else []
     lines += [_table(cells) for cells in stage_tables(summary)]
-    lines += [_parameter_table(summary)]
+    lines += [_table(parameter_cells(summary))]
     if any(row.factor for row in summary.parameters):
         lines.append(f"{sigma_note(summary.rig)}\n")
     if summary.signals:
-        head = [("sensor", "signal", "measured", "good", "", "seen")]
-        lines.append(_table(head + [_signal_cells(signal) for signal in summary.signals]))
+        lines.append(_table(signal_cells(summary)))
+    if summary.limits:
+        lines.append(_table(limit_cells(summary)))
     lines.append(f"{summary.verdict.value}")
     lines += [f"  {reason.verdict.value:5} {one_line(reason.text, 1000)}" for reason in summary.reasons]
     return "\n".join(lines)
@@ -172,20 +193,43 @@ def _model_scores(summary: Summary, camera: str) -> list[str]:
     return [text for text in found if text]
 
 
-def _parameter_table(summary: Summary) -> str:
-    """Return the parameters as text; the columns plain and factor only where they hold anything."""
-    cells = [("parameter", "value", "sigma", "plain", "factor", "unit", "status")] + [_cells(row) for row in summary.parameters]
-    return _table(cells if summary.has_plain else [(*row[:3], *row[5:]) for row in cells])
+def about(summary: Summary) -> str:
+    """Return which stages of which inputs the report tells of."""
+    runs = summary.rig.provenance
+    stages = ", ".join(dict.fromkeys(run.stage for run in runs)) or "rig"
+    names = ", ".join(dict.fromkeys(file.name for run in runs for file in run.inputs))
+    return f"{stages} of {names}" if names else stages
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def parameter_cells(summary: Summary) -> list[tuple[str, ...]]:
+    """Return the table of parameters, its head first; the columns plain and factor only where they hold anything."""
+    cells = [("parameter", "value", "sigma", "plain", "factor", "unit", "status"), *map(_parameter, summary.parameters)]
+    return cells if summary.has_plain else [(*row[:3], *row[5:]) for row in cells]
+
+
+def _parameter(row: Row) -> tuple[str, ...]:
     status = row.status.value + (f" ({row.note})" if row.note else "")
     return (f"{row.part} {row.name}", row.value_text, row.sigma_text, row.sigma_plain_text, row.factor_text, row.unit, status)
 
 
-def _signal_cells(signal: Signal) -> tuple[str, ...]:
+def signal_cells(summary: Summary) -> list[tuple[str, ...]]:
+    """Return the table of signals, its head first."""
+    return [("sensor", "signal", "measured", "good", "", "seen"), *map(_signal, summary.signals)]
+
+
+def _signal(signal: Signal) -> tuple[str, ...]:
     unit = f" {signal.probe.unit}" if signal.probe.unit else ""
     return (signal.sensor, signal.probe.title, f"{signal.value:.3g}{unit}", signal.probe.limit, signal.mark, signal.note)
+
+
+def limit_cells(summary: Summary) -> list[tuple[str, ...]]:
+    """Return the table of limits, its head first."""
+    return [("limit", "on", "measured", "asked for", ""), *map(_limit, summary.limits)]
+
+
+def _limit(one: Check) -> tuple[str, ...]:
+    stage = f" ({one.stage})" if one.stage else ""
+    return (one.name, f"{one.part} {one.what}{stage}", one.measured, one.limit, one.reason.verdict.value)
 
 
 def _table(cells: Sequence[Sequence[str]]) -> str:
@@ -195,7 +239,7 @@ def _table(cells: Sequence[Sequence[str]]) -> str:
 
 
 def as_json(summary: Summary, pictures: Sequence[dict[str, str]] = ()) -> dict[str, object]:
-    """Return the report for machines, schema calibkit-report/1: SI units and px, null where nothing is known, names as in the rig file.
+    """Return the report for machines, schema calibkit-report/1: SI units and px (limits: as asked), null where nothing is known.
 
     Keys are added, never renamed, within a version.
     """
@@ -203,6 +247,21 @@ def as_json(summary: Summary, pictures: Sequence[dict[str, str]] = ()) -> dict[s
         "schema": SCHEMA,
         "verdict": summary.verdict.value,
         "reasons": [{"verdict": reason.verdict.value, "text": reason.text} for reason in summary.reasons],
+        "limits": [
+            {
+                "name": one.name,
+                "part": one.part,
+                "stage": one.stage or None,
+                "what": one.what,
+                "value": one.value,
+                "low": one.low,
+                "high": one.high,
+                "unit": one.unit,
+                "holds": one.holds,
+                "note": one.note,
+            }
+            for one in summary.limits
+        ],
         "not_observable": [f"{row.part}.{row.name}" for row in summary.parameters if row.value is None],
         "parameters": [
             {

@@ -14,12 +14,13 @@ from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.models.imu import STANDARD_GRAVITY, Gravity
 from calibkit.report.summary import Summary
+from calibkit.stages.camera_imu import name_imu
 from calibkit.stages.intrinsics import AUTO, intrinsics, name_cameras
 from calibkit.stages.intrinsics import Options as LensOptions
 from calibkit.stages.joint import Options as JointOptions
-from calibkit.stages.joint import joint, name_imu
+from calibkit.stages.joint import joint
 from calibkit.stages.outputs import Outputs, Saved
-from calibkit.stages.report import FILES, report
+from calibkit.stages.report import FILES, Files, report
 from calibkit.stages.time_offset import Options as OffsetOptions
 from calibkit.stages.time_offset import time_offset
 
@@ -92,7 +93,7 @@ def calibrate(
         if unknown := _unknown_lens(done[-1].result.rig):
             notes += [f"{later.stage} was not run: {unknown} is not observable" for later in steps[len(done) :]]
             break
-    summary = report(outputs.out, outputs.report, outputs.json, outputs.force)
+    summary = report(outputs.out, Files(outputs.report, outputs.json, force=outputs.force))
     files = [*dict.fromkeys(file for saved in done for file in saved.files)]
     files += [file for file in (outputs.json, outputs.report and outputs.report / FILES[0]) if file is not None]
     return Calibrated(summary, tuple(files), tuple(dict.fromkeys([*notes, *_warnings(done)])), failed)

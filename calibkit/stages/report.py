@@ -1,36 +1,62 @@
 """The report of any result: from the stage that just made it, or later from the rig file and its residual files, without the recording."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig, StageRun
 from calibkit.errors import BadInputError, one_line
-from calibkit.io.atomic import refuse_existing, refuse_unwritable, write_atomic, write_json
+from calibkit.io.atomic import reason_of, refuse_existing, refuse_unwritable, write_atomic, write_json
 from calibkit.io.residual_file import entry_hashes, load_result
 from calibkit.io.rig_file import load_rig
-from calibkit.report.summary import Summary, as_json, summarise
+from calibkit.report.junit import junit
+from calibkit.report.markdown import markdown
+from calibkit.report.summary import NOTHING, Demands, Summary, as_json, summarise
 
-FILES = ("report.html", "report.json")
+FILES = ("report.html", "report.json", "report.md")
 
 
-def report(rig_path: Path, out_dir: Path | None = None, json_path: Path | None = None, force: bool = False) -> Summary:
-    """Judge a rig file by its own verdicts and its residual files, and write the report where one is asked for.
+@dataclass(frozen=True)
+class Files:
+    """Where a report goes; what is None is not written."""
 
-    BadInputError, with nothing written, for a missing or changed file and for outputs that exist already.
+    folder: Path | None = None  # report.html, report.md, report.json, pictures
+    json: Path | None = None
+    markdown: Path | None = None
+    junit: Path | None = None
+    pictures: tuple[str, ...] = ("png",)  # their formats, in the folder
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise BadInputError where one of them cannot be written."""
+        if self.folder is not None:
+            check_out_dir(self.folder, self.force)
+        for path in (self.json, self.markdown, self.junit):
+            if path is not None:
+                refuse_unwritable(path, self.force)
+
+
+NONE = Files()
+
+
+def report(rig_path: Path, files: Files = NONE, demands: Demands = NOTHING, strict: bool = False) -> Summary:
+    """Judge a rig file by its own verdicts, its residual files and what is asked for, and write the report where one is wanted.
+
+    BadInputError, with nothing written, for a missing or changed file, for outputs that exist already and for a limit on nothing.
     """
-    if out_dir is not None:
-        check_out_dir(out_dir, force)
-    if json_path is not None:
-        refuse_unwritable(json_path, force)
+    files.check()
     rig = load_rig(rig_path)
     results, earlier = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
-    summary = summarise(rig, results, earlier)
-    if out_dir is not None:
-        _write_pages(summary, out_dir)
-    if json_path is not None:
-        write_json(json_path, as_json(summary), force)
+    summary = summarise(rig, results, earlier, demands)
+    if files.folder is not None:
+        _write_pages(summary, files.folder, files.pictures)
+    if files.markdown is not None:
+        write_atomic(files.markdown, markdown(summary), files.force)
+    if files.junit is not None:
+        write_atomic(files.junit, junit(summary, strict), files.force)
+    if files.json is not None:
+        write_json(files.json, as_json(summary), files.force)
     return summary
 
 
@@ -87,13 +113,13 @@ def _without(result: Result, parts: set[str]) -> Result:
     )
 
 
-def _write_pages(summary: Summary, out_dir: Path) -> None:
+def _write_pages(summary: Summary, out_dir: Path, formats: Sequence[str] = Files.pictures) -> None:
     from calibkit.report.page import build  # matplotlib and jinja2: not needed where only the verdict is asked for
 
-    files: Mapping[str, bytes] = build(summary)
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError(f"{one_line(out_dir)}: cannot be made ({one_line(error.strerror or error)}); choose another folder") from None
-    for name, content in files.items():
-        write_atomic(out_dir / name, content, overwrite=True)
+    for name, content in build(summary, formats).items():
+        path = out_dir / name
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInputError(f"{one_line(path.parent)}: cannot be made ({reason_of(error)}); choose another folder") from None
+        write_atomic(path, content, overwrite=True)

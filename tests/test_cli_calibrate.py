@@ -61,7 +61,7 @@ def asked(folder: Path, session: Session) -> tuple[object, ...]:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "draw", lambda view: [])
+    monkeypatch.setattr(page, "draw", lambda view, kind: [])
 
 
 def stages_of(rig: Path) -> list[str]:
@@ -102,7 +102,7 @@ def test_from_a_recording_to_a_rig_file_and_one_report(
 ) -> None:
     out, pages, js = tmp_path / "rig.yaml", tmp_path / "report", tmp_path / "all.json"
     drawn: list[tuple[str, str]] = []
-    monkeypatch.setattr(page, "draw", lambda view: drawn.append((view.sensor, view.stage)) or [])
+    monkeypatch.setattr(page, "draw", lambda view, kind: drawn.append((view.sensor, view.stage)) or [])
     said = run(*asked, "-o", out, "--report", pages, "--json", js)
     assert said.code == 0, said
     assert stages_of(out) == STAGES

@@ -162,7 +162,8 @@ def _named(limit: Limit, known: dict[str, list[_Number]]) -> list[_Number]:
     if group and not any(other.startswith(limit.name.split(".")[0] + ".") for other in known):
         raise BadInputError(f"{limit.source}: this rig has no {group}; leave this limit out")
     words = sorted(re.split(r"[._]", limit.name))
-    near = difflib.get_close_matches(limit.name, known, 1) or [other for other in known if sorted(re.split(r"[._]", other)) == words]
+    near = [other for other in known if sorted(re.split(r"[._]", other)) == words or other.startswith(f"{limit.name}.")]
+    near = sorted(near, key=len) or difflib.get_close_matches(limit.name, known, 1)
     hint = f"did you mean {one_line(near[0], 80)}?" if near else "docs/ci.md lists the names"
     raise BadInputError(f"{limit.source}: nothing in this rig is called {name}; {hint}")
 

@@ -31,11 +31,11 @@ def _of_file(path: Path) -> tuple[dict[str, Limit], bool]:
     document = load_yaml(path)
     if not isinstance(document.data, dict):
         raise document.error([], "holds no limits; write one a line, such as reprojection_rms: 0.3px")
-    required = document.data.pop(_REQUIRE, False)
+    required = document.data.get(_REQUIRE, False)
     if not isinstance(required, bool):
         raise document.error([_REQUIRE], "is neither true nor false")
     limits = {}
-    for name, value in document.data.items():
+    for name, value in ((name, value) for name, value in document.data.items() if name != _REQUIRE):
         source = f"{one_line(path)}, line {document.line_of([name])}: {one_line(name, 80)}: {one_line(value, 80)}"
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise BadInputError(f"{source}: is no limit; write a number with its unit, such as 0.3px")

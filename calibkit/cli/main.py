@@ -23,6 +23,7 @@ COMMANDS: tuple[str, ...] = (
     "handeye",
     "joint",
     "calibrate",
+    "diagnose",
     "report",
     "import_",
     "export",

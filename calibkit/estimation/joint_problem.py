@@ -9,7 +9,7 @@ walk   b_{j+1} - b_j ~ N(0, walk^2 h)
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from calibkit.estimation.camera_problem import CameraViews, Shutter, corner_prod
 from calibkit.estimation.joint_parts import Index, Part, assemble
 from calibkit.estimation.joint_state import (
     A_G,
+    DRIFTING,
     EXTRAS,
     IMU_MODEL,
     KNOT,
@@ -73,6 +74,19 @@ class GravityPrior:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """What cameras' parameters may go with: time, or a temperature."""
+
+    name: str
+    t: Array  # (k,) s
+    value: Array  # (k,) linear between
+
+    def at(self, t: Array) -> Array:
+        out: Array = np.interp(t, self.t, self.value)
+        return out
+
+
+@dataclass(frozen=True)
 class Seen:
     """One camera's frames on the trajectory."""
 
@@ -96,11 +110,13 @@ class JointProblem:
     lens_priors: tuple[tuple[Array, Array] | None, ...] = ()  # lens and information (l, l) of each camera, where it is known
     imu_prior: tuple[ImuModel, Array] | None = None  # and information about what is free of it, in the order of IMU_MODEL
     extras: tuple[str, ...] = ()  # of joint_state.EXTRAS: what else is free
+    drifts: tuple[Drift, ...] = ()
     held: bool = False  # the calibration, and the trajectory alone is free
 
     @property
     def border(self) -> Border:
-        return Border(tuple(len(frames.views.model.parameter_names) for frames in self.cameras), self.extras)
+        sizes = tuple(len(frames.views.model.parameter_names) for frames in self.cameras)
+        return Border(sizes, self.extras, tuple(drift.name for drift in self.drifts))
 
     def retract(self, x: JointState, core: Array, border: Array) -> JointState:
         return retract(x, self.border, core, border)
@@ -272,7 +288,19 @@ class JointProblem:
             N = np.swapaxes(chain, 1, 2) @ G @ chain
             corners = int(np.count_nonzero(frames.views.weight[rows]))
             t, touch = (frames.t + camera.dt)[rows], np.arange(where.start, where.stop)
-            yield Part(f"camera {c}", t, i[rows], offsets, touch, N, cost, 2 * corners)
+            yield self._drifting(Part(f"camera {c}", t, i[rows], offsets, touch, N, cost, 2 * corners), c)
+
+    def _drifting(self, part: Part, c: int) -> Part:
+        """Return camera c's part with the columns of drifts: those of its first parameters times what they go with."""
+        if not self.drifts:
+            return part
+        n, q, unit = len(part.first), len(part.offsets), np.eye(part.N.shape[-1])
+        moved = [drift.at(part.t_s)[:, None, None] * unit[:, q : q + DRIFTING] for drift in self.drifts]
+        same, left = (np.broadcast_to(columns, (n, *columns.shape)) for columns in (unit[:, :-1], unit[:, -1:]))
+        chain = np.concatenate([same, *moved, left], axis=2)
+        where = [self.border[f"{drift.name} {c}"] for drift in self.drifts]
+        touch = [part.touch, *(np.arange(block.start, block.stop) for block in where)]
+        return replace(part, touch=np.concatenate(touch), N=np.swapaxes(chain, 1, 2) @ part.N @ chain)
 
     def _walk(self, x: JointState) -> Part:
         """Biases walk: information 1 / (walk^2 h) ties each knot's to the next one's."""

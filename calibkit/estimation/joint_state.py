@@ -40,6 +40,7 @@ class JointState:
 SCALE, M_A, M_G, PHI, A_G, LINE = "board scale", "M_a", "M_g", "phi_g_i", "A_g", "line delay"
 EXTRAS = {SCALE: 1, M_A: 6, M_G: 6, PHI: 3, A_G: 9, LINE: 1}
 IMU_MODEL = {M_A: ACCEL_PARAMETERS[:6], M_G: GYRO_PARAMETERS[:6], PHI: GYRO_PARAMETERS[6:9], A_G: SENSITIVITY_PARAMETERS}
+DRIFTING = 9  # of a camera: T (rho, phi), dt, fx and fy, the first columns of `Border.camera`
 LINE_SCALE = 1e-3  # the unknown of a line delay is its delay of a thousand rows
 
 
@@ -49,19 +50,21 @@ class Border:
 
     lens_sizes: tuple[int, ...]
     extras: tuple[str, ...] = ()
+    drifts: tuple[str, ...] = ()  # names of what T, dt and focal length go with
 
     @property
     def _blocks(self) -> dict[str, slice]:
         sizes = {"gravity": 3, **{name: size for name, size in EXTRAS.items() if name in self.extras and name != LINE}}
         for c, lens in enumerate(self.lens_sizes):
             sizes |= {f"T {c}": 6, f"dt {c}": 1, f"lens {c}": lens, **({f"{LINE} {c}": 1} if LINE in self.extras else {})}
+        sizes |= {f"{drift} {c}": DRIFTING for drift in self.drifts for c in range(len(self.lens_sizes))}
         out, start = {}, 0
         for name, size in sizes.items():
             out[name] = slice(start, start := start + size)
         return out
 
     def __getitem__(self, name: str) -> slice:
-        """Return where "gravity", an extra of the IMU, or "T c", "dt c", "lens c", "line delay c" of camera c stands."""
+        """Return where "gravity", an extra of the IMU, or "T c", "dt c", "lens c", "line delay c", "DRIFT c" of camera c stands."""
         return self._blocks[name]
 
     def camera(self, c: int) -> slice:
@@ -81,7 +84,7 @@ class Border:
 
     @property
     def size(self) -> int:
-        return int(self.camera(len(self.lens_sizes) - 1).stop)
+        return int(max(block.stop for block in self._blocks.values()))
 
 
 def retract(x: JointState, where: Border, core: Array, border: Array) -> JointState:

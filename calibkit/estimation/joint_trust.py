@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import schur
 from calibkit.estimation.joint_parts import projected
-from calibkit.estimation.joint_state import A_G, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE
+from calibkit.estimation.joint_state import A_G, DRIFTING, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE
 from calibkit.estimation.lens_fit import rows_of
 from calibkit.estimation.lens_trust import biased, lens_scales
 from calibkit.estimation.open_directions import TRANSFORM_SCALES
@@ -128,4 +128,6 @@ def border_scales(fit: JointFit) -> Array:
         if LINE in fit.problem.extras:
             rows = frames.views.image_size[1]
             scales[border[f"{LINE} {c}"]] = SCALES["s"] / (LINE_SCALE * rows)  # of the whole readout
+        for drift in fit.problem.drifts:
+            scales[border[f"{drift.name} {c}"]] = scales[border.camera(c)][:DRIFTING]
     return scales

@@ -51,6 +51,7 @@ _NAMES = {
     "sigma_px": ("sigma_px", "sigma"),
     "rate": ("rate", "table_rate"),
     "run": ("run",),
+    "temperature": ("temperature", "temp", "celsius", "t_c"),
     "nx": ("nx", "axis_x"),
     "ny": ("ny", "axis_y"),
     "nz": ("nz", "axis_z"),

@@ -1,0 +1,144 @@
+"""What is wrong with a calibration, by the fewest of many suspected causes that explain why new data ask for another one.
+
+New data want the calibration moved by delta, known to P = their own covariance + that of the calibration under test. If only some
+causes C are at work, delta = C theta + noise, so that with M = P^-1
+
+    theta = (C^T M C)^-1 C^T M delta        evidence = theta^T C^T M C theta ~ chi^2 of as many degrees of freedom as C has columns
+
+where nothing is wrong: generalised least squares and its score test (Rao 1948). Causes are taken one after the other, each beside those
+before, as long as one is significant; the chance that any is named where none is there stays below FAMILY_WISE (Bonferroni).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from calibkit.geometry.so3 import Array
+
+FAMILY_WISE = 0.01
+_MOST = 4  # causes at once: with more the calibration as a whole does not fit
+_AS_GOOD = 9.0  # of evidence: another cause that has less than this less is not told from the first
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A cause that may be wrong."""
+
+    key: str
+    columns: Array  # (p, d) what it moves
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What new data say about a calibration."""
+
+    delta: Array  # (p,) how they want it moved
+    cov: Array  # (p, p) of that, the calibration's own included
+    information: Array  # (p, p) of the new data alone, all else free: what their cost grows by
+    scales: Array  # (p,) what each must be known to
+    freedom: float  # independent blocks behind the covariance
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A suspect that is found guilty."""
+
+    key: str
+    theta: Array  # (d,) its size
+    cov: Array  # (d, d)
+    log_p: float  # natural logarithm of the chance of as much evidence, or more, where it is innocent
+    share: float  # of what the data lose by the calibration: what mending this, after those before, brings back
+    alike: tuple[str, ...] = ()  # suspects that this recording does not tell from it
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    causes: tuple[Cause, ...]
+    sigmas: dict[str, float]  # of each suspect alone, in units of what must be known: the least that would be found is some 4 times that
+    unexplained_log_p: float  # of what the causes leave
+
+
+def diagnose(evidence: Evidence, suspects: Sequence[Suspect]) -> Diagnosis:
+    """Return the causes, the first the strongest."""
+    scaled = _Scaled.of(evidence)
+    columns = {suspect.key: suspect.columns / evidence.scales[:, None] for suspect in suspects}
+    limit = np.log(FAMILY_WISE / max(len(suspects), 1))
+    chosen: list[str] = []
+    alike: dict[str, tuple[str, ...]] = {}
+    log_p: dict[str, float] = {}
+    while len(chosen) < _MOST:
+        tried = {key: scaled.gain(columns, chosen, key) for key in columns if key not in chosen}
+        tests = {key: scaled.log_p(gain, columns[key].shape[1]) for key, gain in tried.items()}
+        if not tests or min(tests.values()) > limit:
+            break
+        best = min(tests, key=lambda key: tests[key])
+        alike[best] = tuple(key for key in tests if key != best and tried[key] > tried[best] - _AS_GOOD and tests[key] < limit)
+        log_p[best] = tests[best]
+        chosen.append(best)
+        for key in chosen[:-1]:  # one that the others explain was none
+            others = [other for other in chosen if other != key]
+            if scaled.log_p(scaled.gain(columns, others, key), columns[key].shape[1]) > limit:
+                chosen = others
+    theta, cov = scaled.sizes(columns, chosen)
+    causes, left, start = [], scaled.delta, 0
+    whole = float(left @ scaled.information @ left)
+    for key in chosen:
+        part = slice(start, start := start + columns[key].shape[1])
+        before = float(left @ scaled.information @ left)
+        left = left - columns[key] @ theta[part]
+        share = (before - float(left @ scaled.information @ left)) / max(whole, 1e-300)
+        causes.append(Cause(key, theta[part], cov[part, part], log_p[key], share, alike[key]))
+    sigmas = {key: scaled.sigma(each) for key, each in columns.items()}
+    rest = scaled.chi2 - scaled.evidence(columns, chosen)
+    return Diagnosis(tuple(causes), sigmas, scaled.log_p(max(rest, 0.0), len(evidence.delta) - len(theta)))
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    """The evidence in units of what must be known."""
+
+    delta: Array
+    M: Array  # P^-1
+    information: Array
+    freedom: float
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> "_Scaled":
+        s = evidence.scales
+        values, vectors = np.linalg.eigh(evidence.cov / s / s[:, None])
+        M = vectors / np.maximum(values, values[-1] * 1e-15) @ vectors.T
+        return cls(evidence.delta / s, M, evidence.information * s * s[:, None], evidence.freedom)
+
+    @property
+    def chi2(self) -> float:
+        return float(self.delta @ self.M @ self.delta)
+
+    def sizes(self, columns: dict[str, Array], keys: Sequence[str]) -> tuple[Array, Array]:
+        if not keys:
+            return np.zeros(0), np.zeros((0, 0))
+        C = np.concatenate([columns[key] for key in keys], axis=1)
+        cov = np.linalg.pinv(C.T @ self.M @ C, hermitian=True)
+        return cov @ C.T @ self.M @ self.delta, cov
+
+    def evidence(self, columns: dict[str, Array], keys: Sequence[str]) -> float:
+        if not keys:
+            return 0.0
+        theta, _ = self.sizes(columns, keys)
+        C = np.concatenate([columns[key] for key in keys], axis=1)
+        return float(theta @ C.T @ self.M @ self.delta)
+
+    def gain(self, columns: dict[str, Array], beside: Sequence[str], key: str) -> float:
+        """Return the evidence that a suspect adds to others."""
+        return self.evidence(columns, [*beside, key]) - self.evidence(columns, beside)
+
+    def log_p(self, chi2: float, d: int) -> float:
+        """Return log P(evidence >= chi2): F, since the covariance is itself known by some blocks only."""
+        return float(stats.f.logsf(chi2 / max(d, 1), max(d, 1), self.freedom)) if d else 0.0
+
+    def sigma(self, column: Array) -> float:
+        """Return how well the recording tells a suspect by itself, relative to what its own columns must be known to."""
+        cov = np.linalg.pinv(column.T @ self.M @ column, hermitian=True)
+        size = np.linalg.norm(column, axis=0)
+        return float(np.max(np.sqrt(np.diag(cov)) * size))

@@ -1,0 +1,151 @@
+"""What is said of each cause that a diagnosis may find: what is wrong and by how much, with sigma, and what to do."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibkit.estimation.diagnosis import Cause
+from calibkit.estimation.joint_state import LINE_SCALE
+from calibkit.estimation.pixel_grid import grid
+from calibkit.geometry.so3 import Array
+from calibkit.models.cameras import CameraModel
+
+_TURNS = {"x": "pitch", "y": "yaw", "z": "roll"}
+
+
+@dataclass(frozen=True)
+class About:
+    """What the words are of."""
+
+    cameras: tuple[str, ...]
+    imu: str
+    models: tuple[CameraModel, ...]
+    lenses: tuple[Array, ...]
+    sizes: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Told:
+    """A cause in words."""
+
+    text: str
+    mend: str
+    theta: tuple[float, ...]  # in `unit`
+    sigma: tuple[float, ...]
+    unit: str
+
+
+def in_words(cause: Cause, about: About) -> Told:
+    """Return what is wrong, by how much, and what to do."""
+    base, _, drift = cause.key.partition(" with ")
+    name, c = base.rsplit(" ", 1) if base[-1].isdigit() else (base, "0")
+    k = int(c)
+    unit, scale, say, mend = _SAYINGS[name]
+    theta, sigma = cause.theta * scale, np.sqrt(np.diag(cause.cov)) * scale
+    size = ", ".join(number(abs(x) if len(theta) == 1 else x, s) for x, s in zip(theta, sigma, strict=True))
+    per = _PER.get(drift, "")
+    said = say(about.cameras[k], about.imu, theta, f"{size} {unit}{per}", bool(drift))
+    if name == "distortion":
+        said += f", up to {_worst_px(cause.theta, about, k):.2g} px at the image's edge"
+    cure = _DRIFTS[drift] if drift else mend
+    return Told(said, cure.format(camera=about.cameras[k], imu=about.imu), tuple(theta.tolist()), tuple(sigma.tolist()), f"{unit}{per}")
+
+
+def number(value: float, sigma: float) -> str:
+    """Return a value with its sigma in two digits."""
+    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9)) if sigma > 0 else 3
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}"
+
+
+def _worst_px(theta: Array, about: About, c: int) -> float:
+    model, lens = about.models[c], about.lenses[c]
+    rays, valid = model.unproject(grid(about.sizes[c]), lens)
+    projection = model.project(rays[valid], lens, jacobians=True)
+    assert projection.J_params is not None
+    return float(np.max(np.linalg.norm(projection.J_params[:, :, 4:] @ theta, axis=1)))
+
+
+Say = Callable[[str, str, Array, str, bool], str]
+
+
+def _offset(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
+    if drifts:
+        return f"the offset of {camera}'s clock {'grows' if theta[0] > 0 else 'falls'} by {size}"
+    return f"{camera}'s stamps are {size} {'earlier' if theta[0] > 0 else 'later'} than dt_{imu}_{camera} says"
+
+
+def _turn(axis: str) -> Say:
+    def say(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
+        way = "about" if theta[0] > 0 else "the other way about"
+        return f"{camera} {'creeps' if drifts else 'is turned'} by {size} {way} its own {axis} axis ({_TURNS[axis]})"
+
+    return say
+
+
+def _shift(axis: str) -> Say:
+    def say(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
+        return f"{camera} {'creeps' if drifts else 'sits'} {size} {'along' if theta[0] > 0 else 'against'} {imu}'s {axis} axis"
+
+    return say
+
+
+def _length(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
+    verb = ("grows" if theta[0] > 0 else "shrinks") if drifts else ("is longer" if theta[0] > 0 else "is shorter")
+    return f"{camera}'s focal length {verb} by {size}"
+
+
+def _plain(text: str) -> Say:
+    return lambda camera, imu, theta, size, drifts: text.format(camera=camera, imu=imu, size=size)
+
+
+def _board(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
+    return f"the board is {size} {'larger' if theta[0] > 0 else 'smaller'} than its file says"
+
+
+_LENS, _MOUNT = "run calibkit intrinsics again, then joint", "its mount has moved: run calibkit joint again, and look at the mount"
+# By name: unit, its worth of one in SI, what is said, what to do.
+_SAYINGS: dict[str, tuple[str, float, Say, str]] = {
+    "dt": ("ms", 1e3, _offset, "run calibkit timeoffset or joint again"),
+    **{f"R_{axis}": ("deg", float(np.degrees(1)), _turn(axis), _MOUNT) for axis in "xyz"},
+    **{f"p_{axis}": ("mm", 1e3, _shift(axis), _MOUNT) for axis in "xyz"},
+    "focal": ("px", 1.0, _length, _LENS),
+    "centre": ("px", 1.0, _plain("the centre of {camera}'s lens has moved by ({size})"), _LENS),
+    "distortion": ("", 1.0, _plain("{camera}'s lens bends otherwise than its distortion says"), _LENS),
+    "line delay": (
+        "us",
+        1e6 * LINE_SCALE,
+        _plain("{camera}'s rows are read {size} a row apart from what its line_delay says"),
+        "run calibkit joint --line-delay",
+    ),
+    "board scale": ("%", 100.0, _board, "measure it, and write its size into the target file"),
+    "gyroscope scale": (
+        "%",
+        100.0,
+        _plain("{imu}'s gyroscope reads too much by ({size}) about its axes"),
+        "run calibkit imu, or joint --imu-model scale-misalignment",
+    ),
+    "gyroscope axes": (
+        "mrad",
+        1e3,
+        _plain("{imu}'s gyroscope has its axes askew"),
+        "run calibkit imu, or joint --imu-model scale-misalignment",
+    ),
+    "accelerometer scale": (
+        "%",
+        100.0,
+        _plain("{imu}'s accelerometer reads too much by ({size}) along its axes"),
+        "run calibkit imu, or joint --imu-model scale-misalignment",
+    ),
+    "accelerometer axes": (
+        "mrad",
+        1e3,
+        _plain("{imu}'s accelerometer has its axes askew"),
+        "run calibkit imu, or joint --imu-model scale-misalignment",
+    ),
+}
+_PER = {"time": " a minute", "temperature": " per 10 K"}
+_DRIFTS = {
+    "time": "it drifts within the recording: let {camera} warm up, look at its mount or clock",
+    "temperature": "it goes with the temperature: calibrate at the temperature of use, or hold {camera} at one",
+}

@@ -1,0 +1,219 @@
+"""`calibkit diagnose`: whether a calibration still fits a recording that it was not made from, and what is wrong with it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from calibkit.data.progress import Progress, silent
+from calibkit.data.rig import Rig
+from calibkit.errors import BadInputError
+from calibkit.estimation.diagnosis import Diagnosis, Suspect, diagnose
+from calibkit.estimation.diagnosis_words import About, Told, in_words
+from calibkit.estimation.joint import CameraInput, Joint
+from calibkit.estimation.joint_known import known_calibration
+from calibkit.estimation.joint_problem import Drift
+from calibkit.estimation.joint_suspects import Known, evidence, rms_by_sensor, with_trajectory
+from calibkit.geometry.so3 import Array
+from calibkit.io.temperature_file import load_temperature
+from calibkit.models.cameras import CAMERAS
+from calibkit.solver.trust import WEAK
+from calibkit.stages.camera_imu import CameraImu, Sensors, read_camera_imu
+
+_A_MINUTE_S, _TEN_K = 60.0, 10.0
+_NOISIER = 1.4  # than it was: twice the variance
+_HIDES = 1.2  # times the noise: who sees it may raise R
+_LEAST_K = 1.0  # of temperature, that something may go with it
+
+
+@dataclass(frozen=True)
+class Options(Sensors):
+    """Which sensors, how to read them, and what else was measured."""
+
+    temperature: Path | None = None
+    knots_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A sensor that scatters more than the calibration has it."""
+
+    text: str
+    factor: float
+
+
+@dataclass(frozen=True)
+class Rms:
+    """A sensor's residuals by the calibration under test, its trajectory free, and by the recording's own."""
+
+    sensor: str
+    unit: str
+    held: float
+    best: float
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """What was found."""
+
+    what: str
+    diagnosis: Diagnosis
+    told: tuple[Told, ...]  # of each cause
+    noise: tuple[Noise, ...]
+    untested: tuple[str, ...]
+    rms: tuple[Rms, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """Return what is said on the terminal."""
+        out = [self.what, "", f"{'residuals, rms':26}{'by the rig file':>16}{'at best':>12}"]
+        out += [f"  {each.sensor:24}{each.held:>16.3g}{each.best:>12.3g} {each.unit}" for each in self.rms]
+        for cause, told in zip(self.diagnosis.causes, self.told, strict=True):
+            out += ["", f"  {told.text} ({100 * cause.share:.0f} % of the excess)", f"    {told.mend}"]
+            out += [f"    this motion does not tell it from: {', '.join(cause.alike)}"] if cause.alike else []
+        out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
+        out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
+        return "\n".join([*out, "", self.verdict])
+
+    @property
+    def verdict(self) -> str:
+        """Return the answer in one line."""
+        if self.told:
+            worst = max(self.rms, key=lambda rms: rms.held / rms.best)
+            hide = f": noise of {worst.held:.2g} {worst.unit} for {worst.sensor} would hide it" if worst.held > _HIDES * worst.best else ""
+            return f"FAIL: {self.told[0].text}; it is not noise{hide}"
+        return "PASS: the calibration fits this recording within its own uncertainty" + (", but for its noise" if self.noise else "")
+
+    def as_json(self) -> dict[str, object]:
+        """Return everything, for machines."""
+        return {
+            "schema": "calibkit-diagnosis-1",
+            "verdict": "FAIL" if self.told else "PASS",
+            "causes": [
+                {
+                    "key": cause.key,
+                    "text": told.text,
+                    "mend": told.mend,
+                    "size": list(told.theta),
+                    "sigma": list(told.sigma),
+                    "unit": told.unit,
+                    "share": cause.share,
+                    "log10_p": cause.log_p / float(np.log(10)),
+                    "alike": list(cause.alike),
+                }
+                for cause, told in zip(self.diagnosis.causes, self.told, strict=True)
+            ],
+            "noise": [{"text": each.text, "factor": each.factor} for each in self.noise],
+            "not_tested": list(self.untested),
+            "rms": [{"sensor": each.sensor, "unit": each.unit, "by_rig": each.held, "at_best": each.best} for each in self.rms],
+            "warnings": list(self.warnings),
+        }
+
+    @property
+    def exit_code(self) -> int:
+        """SPEC section 6: 1 where a cause is found."""
+        return 1 if self.diagnosis.causes else 0
+
+
+def run_diagnosis(
+    sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent
+) -> Diagnosed:
+    """Test a rig file's cameras and IMU against a recording before a board.
+
+    BadInputError names the file, topic or option that is wrong, or what the rig file lacks.
+    """
+    options = options or Options()
+    read = read_camera_imu(sources, target, rig, options, progress)
+    known = known_calibration(rig, read.names, read.imu_name, read.imu.model)
+    cameras = [CameraInput(views, lens) for views, lens in zip(read.views, read.lenses, strict=True)]
+    joint = read.fitted(cameras, read.settings(spacing=options.knots_s), progress)
+    if not joint.fit.converged:
+        raise BadInputError(
+            f"{read.recording.name}: cameras and IMU do not fit together at any calibration: run calibkit joint, which says why"
+        )
+    drifts = [Drift("time", *_ramp(joint)), *_of_temperature(joint, options.temperature)]
+    with threadpool_limits(1, user_api="blas"):
+        found, suspects = evidence(joint.fit, known, drifts)
+        diagnosis = diagnose(found, suspects)
+        rms = _rms(joint, known, read)
+    about = About(
+        read.names,
+        read.imu_name,
+        tuple(CAMERAS[lens.model] for lens in read.lenses),
+        tuple(camera.lens for camera in joint.fit.x.cameras),
+        tuple(views.image_size for views in read.views),
+    )
+    return Diagnosed(
+        _what(joint, read),
+        diagnosis,
+        tuple(in_words(cause, about) for cause in diagnosis.causes),
+        _noise(rms, joint, read),
+        _untested(diagnosis, suspects),
+        rms,
+        tuple(read.warnings),
+    )
+
+
+def _ramp(joint: Joint) -> tuple[Array, Array]:
+    """Return minutes since the recording's start."""
+    t = joint.fit.problem.imu.t[[0, -1]]
+    return t, np.asarray((t - t[0]) / _A_MINUTE_S, np.float64)
+
+
+def _of_temperature(joint: Joint, path: Path | None) -> list[Drift]:
+    if path is None:
+        return []
+    t_ns, celsius = load_temperature(path)
+    t = np.asarray((t_ns - joint.origin_ns) * 1e-9, np.float64)
+    first, last = joint.fit.problem.imu.t[[0, -1]]
+    if t[-1] < first or t[0] > last:
+        raise BadInputError(f"{path.name}: its times lie outside of the recording; they must be on the IMU's clock")
+    inside = np.interp([first, last], t, celsius)
+    spread = np.ptp(np.concatenate([celsius[(t > first) & (t < last)], inside]))
+    if spread < _LEAST_K:
+        raise BadInputError(
+            f"{path.name}: the temperature changes by {spread:.2g} K within the recording: nothing can be told to go with it"
+        )
+    return [Drift("temperature", t, np.asarray((celsius - inside[0]) / _TEN_K, np.float64))]
+
+
+def _rms(joint: Joint, known: Known, read: CameraImu) -> tuple[Rms, ...]:
+    problem, x = joint.fit.problem, joint.fit.x
+    held = rms_by_sensor(problem, with_trajectory(problem, replace(x, cameras=known.cameras, imu=known.imu)))
+    best = rms_by_sensor(problem, x)
+    names = {f"camera {c}": (f"{name}'s corners", "px") for c, name in enumerate(read.names)}
+    names |= {"gyro": (f"{read.imu_name}'s gyroscope", "rad/s"), "accel": (f"{read.imu_name}'s accelerometer", "m/s^2")}
+    return tuple(Rms(*names[kind], held[kind], best[kind]) for kind in names)
+
+
+def _what(joint: Joint, read: CameraImu) -> str:
+    corners = sum(int((frames.views.weight > 0).sum()) for frames in joint.fit.problem.cameras)
+    span = joint.fit.problem.imu.t[-1] - joint.fit.problem.imu.t[0]
+    return f"{', '.join(read.names)} and {read.imu_name}: {corners} corners, {len(joint.fit.problem.imu.t)} samples over {span:.4g} s"
+
+
+def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ...]:
+    """Return what scatters more than the rig file has it, with everything free."""
+    found = []
+    for name, lens, each in zip(read.names, read.lenses, rms, strict=False):
+        now = each.best
+        if lens.reprojection is not None and lens.reprojection.rms_px > 0 and (factor := now / lens.reprojection.rms_px) > _NOISIER:
+            text = f"{name}'s corners scatter by {now:.3g} px, {factor:.1f} times what they did at its calibration, whatever the motion"
+            found.append(Noise(f"{text}: noise; its R is {now:.2g} px now. Blur, light, or another lens or board?", factor))
+    known = read.known_imu
+    for kind, density, word in (
+        ("gyro", known.gyro_noise_density, "gyroscope"),
+        ("accel", known.accel_noise_density, "accelerometer"),
+    ):
+        if density is not None and density.value and (factor := joint.fit.factors[kind]) > _NOISIER:
+            real = factor * density.value
+            text = f"{read.imu_name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
+            found.append(Noise(f"{text}: {real:.2e} {density.unit}. Vibration?", factor))
+    return tuple(found)
+
+
+def _untested(diagnosis: Diagnosis, suspects: Sequence[Suspect]) -> tuple[str, ...]:
+    return tuple(each.key for each in suspects if diagnosis.sigmas[each.key] > WEAK)

@@ -25,6 +25,8 @@ COMMANDS: tuple[str, ...] = (
     "calibrate",
     "diagnose",
     "report",
+    "diff",
+    "budget",
     "import_",
     "export",
     "simulate",

@@ -1,8 +1,10 @@
 """Options that stages have in common, and the outputs that they name."""
 
+import re
 import shlex
 import sys
 from collections.abc import Iterable
+from math import pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,3 +94,26 @@ def gravity_of(value: float | None, latitude: float | None, altitude: float | No
     if not (abs(latitude) <= 90 and abs(altitude or 0) <= 10000):
         raise BadInputError("--latitude is from -90 to 90 deg, --altitude at most 10000 m")
     return gravity_at(latitude, altitude)
+
+
+RATES = {"rad/s": 1.0, "deg/s": pi / 180}
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+SPEEDS = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6}
+_QUANTITY = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)(e[+-]?\d{1,2})?\s*([a-z/]+)\s*")
+_MOST = 1e6  # of any unit
+
+
+def quantity(option: str, text: str, units: dict[str, float], positive: bool = False) -> float:
+    """Return a number with its unit in SI: "60deg/s", "0.5 m"; BadInputError for another unit, none, or a number out of reach."""
+    from calibkit.errors import BadInputError, one_line
+
+    found = _QUANTITY.fullmatch(text[:100])
+    number, unit = (found[1] + (found[2] or ""), found[3]) if found else ("", "")
+    if unit not in units:
+        raise BadInputError(
+            f"{option} {one_line(text, 40)}: write a number with its unit, such as 1{next(iter(units))} ({', '.join(units)})"
+        )
+    value = float(number) * units[unit]
+    if value < 0 or (positive and value == 0) or value > _MOST:
+        raise BadInputError(f"{option} {one_line(text, 40)}: must be {'above' if positive else 'at least'} 0 and at most {_MOST:.0e}")
+    return value

@@ -41,6 +41,16 @@ def reason_of(error: OSError | ValueError) -> str:
     return one_line(getattr(error, "strerror", None) or error)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder for outputs where it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise BadInputError(f"{one_line(folder)}: is a file; give the name of a folder") from None
+    except (OSError, ValueError) as error:
+        raise BadInputError(f"{one_line(folder)}: cannot be made ({reason_of(error)}); choose another") from None
+
+
 def refuse_existing(path: Path, overwrite: bool) -> None:
     """Raise BadInputError where writing `path` would destroy something: to be asked before long work, too."""
     if path.is_dir():

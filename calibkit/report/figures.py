@@ -75,16 +75,21 @@ def draw(view: View, formats: Sequence[str] = ()) -> list[Drawn]:
 
 
 def _render(picture: Picture, view: View, formats: Sequence[str]) -> Drawn:
+    files = rendered(picture.height, lambda figure: picture.draw(figure, view), ("svg", *formats))
+    return Drawn(picture, view, files["svg"], {form: files[form] for form in formats})
+
+
+def rendered(height: float, draw: Callable[[Figure], None], formats: Sequence[str]) -> dict[str, bytes]:
+    """Return a picture, `height` inches high, in each of FORMATS that is asked for; the same drawing gives the same bytes."""
     # From the defaults up: a user's own matplotlibrc would change the bytes. No backend is chosen: Figure draws on its own.
     defaults: dict[Any, Any] = {key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith("backend")}
     with matplotlib.rc_context(defaults | STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in a script that the font lacks
-        figure = Figure(figsize=(9, picture.height), layout="constrained")
-        picture.draw(figure, view)
+        figure = Figure(figsize=(9, height), layout="constrained")
+        draw(figure)
         figure.draw_without_rendering()  # lay out once, not at each saving
         figure.set_layout_engine("none")
-        files = {form: _saved(figure, form) for form in dict.fromkeys(("svg", *formats))}
-    return Drawn(picture, view, files["svg"], {form: files[form] for form in formats})
+        return {form: _saved(figure, form) for form in dict.fromkeys(formats)}
 
 
 def _saved(figure: Figure, form: str) -> bytes:
@@ -132,10 +137,10 @@ def _field(figure: Figure, view: View) -> None:
     for chosen, colour in ((seen & ~sure, PALE), (sure, INK)):
         at = x.ravel()[chosen], y.ravel()[chosen]
         arrows = left.quiver(*at, *found.mean[chosen].T, angles="xy", scale_units="xy", scale=scale, color=colour, width=0.004, pivot="mid")
-    key = _round_down(longest) if longest > 0 else 1.0
+    key = round_down(longest) if longest > 0 else 1.0
     left.quiverkey(arrows, 0.92, -0.13, key, f"{key:g} {view.unit}", labelpos="W", color=INK)
     left.plot(*given(view.centre), "+", color=ACCENT, ms=9)
-    _frame_image(left, view)
+    image_axes(left, given(view.image_size))
     left.set_title("mean residual of each cell; dark: beyond 3 sigma of zero")
     radial, tangential, edges = over_radius(view)
     middle = (edges[1:] + edges[:-1]) / 2
@@ -161,7 +166,7 @@ def _coverage(figure: Figure, view: View) -> None:
         text, colour = (str(counts[row, column]), "white" if many else "black") if counts[row, column] else ("–", ACCENT)
         at = (column + 0.5) * width / columns, (row + 0.5) * height / rows
         axes[0].text(*at, text, color=colour, ha="center", va="center", fontsize=7)
-    _frame_image(axes[0], view)
+    image_axes(axes[0], size)
     axes[0].set_title("kept corners in each cell of the image")
     if both:
         axes[1].hist(np.degrees(frame_tilts(view)), np.arange(0, 91, 5), color=PALE, edgecolor=INK)
@@ -188,13 +193,14 @@ def _frames(figure: Figure, view: View) -> None:
     axes.set_title(textwrap.fill(f"median {middle:.3g} {view.unit} (dashed); worst: {named}", 105))
 
 
-def _frame_image(axes: Axes, view: View) -> None:
-    width, height = given(view.image_size)
+def image_axes(axes: Axes, size: tuple[int, int]) -> None:
+    """Make the axes those of an image of width, height px."""
+    width, height = size
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     axes.spines[:].set_visible(True)
 
 
-def _round_down(value: float) -> float:
+def round_down(value: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten that is not above value."""
     power = 10.0 ** floor(log10(value))
     return max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-12))

@@ -45,7 +45,7 @@ class Row:
         """The value to two digits of its sigma, else as it was given."""
         if self.value is None:
             return "not observable"
-        return f"{self.value:.9g}" if not self.sigma else f"{self.value:.{_decimals(self.sigma)}f}"
+        return f"{self.value:.9g}" if not self.sigma else f"{self.value:.{decimals(self.sigma)}f}"
 
     @property
     def sigma_text(self) -> str:
@@ -60,13 +60,14 @@ class Row:
         return "" if self.factor is None else f"{self.factor:.2f}"
 
 
-def _decimals(sigma: float) -> int:
+def decimals(sigma: float) -> int:
+    """Return how many decimals show two digits of a sigma."""
     return min(max(0, 1 - floor(log10(sigma))), 12)
 
 
 def number(value: float) -> str:
     """Return a sigma in two digits, plain where that is short."""
-    return f"{value:.{_decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}" if value else "0"
+    return f"{value:.{decimals(value)}f}" if 1e-4 <= value < 1e4 else f"{value:.1e}" if value else "0"
 
 
 def parts(rig: Rig) -> list[tuple[str, Camera | Transform | TimeOffset | Imu | ImuIntrinsics]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from calibkit.data.rig import Camera, InputFile, Rig, StageRun
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.model_conversion import nearest
-from calibkit.io.atomic import reason_of, refuse_existing, write_atomic
+from calibkit.io.atomic import make_folder, refuse_existing, write_atomic
 from calibkit.io.foreign import Exporter, camera_values, given_camera
 from calibkit.io.formats import EXPORTERS, IMPORTERS
 from calibkit.io.rig_file import load_rig, merge_rigs, save_rig
@@ -69,7 +69,7 @@ def export_rig(path: Path, to: str, folder: Path, lossy: bool = False, force: bo
     if not exported.files:
         raise BadInputError(f"{one_line(path)}: holds nothing that {to} has a place for; calibrate or import a camera first")
     files = {folder / name: text for name, text in exported.files.items()}
-    _make_folder(folder)
+    make_folder(folder)
     for file in files:
         if file.exists() and file.samefile(path):
             raise BadInputError(f"{one_line(file)}: is the rig file that is exported; choose another folder")
@@ -94,12 +94,3 @@ def _held(name: str, camera: Camera, exporter: Exporter, lossy: bool) -> tuple[C
         raise BadInputError(f"{name}: {exporter.name} would hold {cost}; calibrate again with --model {held}, or pass --lossy")
     values = dict(zip(best.model.parameter_names, best.params.tolist(), strict=True))
     return given_camera(best.model.name, values, camera.resolution, camera.topic), f"{name}: written as {cost}"
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise BadInputError(f"{one_line(folder)}: is a file; give the name of a folder") from None
-    except (OSError, ValueError) as error:
-        raise BadInputError(f"{one_line(folder)}: cannot be made ({reason_of(error)}); choose another") from None

@@ -47,4 +47,4 @@ def escape(text: str) -> str:
     """Return text as Markdown that reads as just that text: no markup, HTML, links, mentions or formulas, and on one line."""
     flat = re.sub(r"([\\`*_\[\]<>|~&$#!@{}])", r"\\\1", one_line(text, 1000))
     flat = re.sub(r"(?i)(:(?=//)|(?<=www)\.)", r"\\\1", flat)  # bare addresses become links
-    return re.sub(r"^([-+=]|\d+(?=[.)]))", lambda found: f"\\{found[0]}" if not found[0].isdigit() else f"{found[0]}\\", flat)
+    return re.sub(r"^([-+=]|\d+(?=[.)](?:\s|$)))", lambda found: f"{found[0]}\\" if found[0].isdigit() else f"\\{found[0]}", flat)

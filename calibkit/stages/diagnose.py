@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from calibkit.data.observations import Times
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
 from calibkit.errors import BadInputError
@@ -126,6 +127,7 @@ def run_diagnosis(
     BadInputError names the file, topic or option that is wrong, or what the rig file lacks.
     """
     options = options or Options()
+    temperature = None if options.temperature is None else load_temperature(options.temperature)
     read = read_camera_imu(sources, target, rig, options, progress)
     known = known_calibration(rig, read.names, read.imu_name, read.imu.model)
     cameras = [CameraInput(views, lens) for views, lens in zip(read.views, read.lenses, strict=True)]
@@ -134,7 +136,7 @@ def run_diagnosis(
         raise BadInputError(
             f"{read.recording.name}: cameras and IMU do not fit together at any calibration: run calibkit joint, which says why"
         )
-    drifts = [Drift("time", *_ramp(joint)), *_of_temperature(joint, options.temperature)]
+    drifts = [Drift("time", *_ramp(joint)), *_of_temperature(joint, options.temperature, temperature)]
     with threadpool_limits(1, user_api="blas"):
         found, suspects = evidence(joint.fit, known, drifts)
         diagnosis = diagnose(found, suspects)
@@ -163,10 +165,10 @@ def _ramp(joint: Joint) -> tuple[Array, Array]:
     return t, np.asarray((t - t[0]) / _A_MINUTE_S, np.float64)
 
 
-def _of_temperature(joint: Joint, path: Path | None) -> list[Drift]:
-    if path is None:
+def _of_temperature(joint: Joint, path: Path | None, read: tuple[Times, Array] | None) -> list[Drift]:
+    if path is None or read is None:
         return []
-    t_ns, celsius = load_temperature(path)
+    t_ns, celsius = read
     t = np.asarray((t_ns - joint.origin_ns) * 1e-9, np.float64)
     first, last = joint.fit.problem.imu.t[[0, -1]]
     if t[-1] < first or t[0] > last:

@@ -74,7 +74,7 @@ def _of_camera(name: str, camera: Camera, use: Use) -> Iterator[Cost]:
     values = of_estimates({key: camera.parameters[key] for key in CAMERAS[camera.model].parameter_names}, camera.covariance)
     known = _known({estimate.status for estimate in camera.parameters.values()}, bool(np.any(values.cov)))
     remedy = f"calibkit intrinsics with more views of the board, in {name}'s corners and tilted"
-    lens = known_lens(camera)
+    lens = known_lens(name, camera)
     if known != "known" or lens is None:
         yield Cost(name, "lens", known, remedy=remedy)
     else:
@@ -135,7 +135,7 @@ def transform_jacobians(name: str, entry: Transform, rig: Rig, range_m: float) -
     """
     a, b = frames_of(name)
     camera = next((frame for frame in (a, b) if frame in rig.cameras), None)
-    lens = None if camera is None else known_lens(rig.cameras[camera])
+    lens = None if camera is None else known_lens(camera, rig.cameras[camera])
     if lens is None:
         return _point_jacobian(range_m * _ALL_AROUND), None
     _, rays = lens.rays()
@@ -157,7 +157,7 @@ def _point_jacobian(points: Array) -> Array:
 def _of_time(name: str, offset: Estimate, rig: Rig, use: Use) -> Iterator[Cost]:
     a, b = frames_of(name)
     camera = next((frame for frame in (b, a) if frame in rig.cameras), None)
-    lens = None if camera is None else known_lens(rig.cameras[camera])
+    lens = None if camera is None else known_lens(camera, rig.cameras[camera])
     remedy = "calibkit timeoffset or joint with faster turns, back and forth"
     gravity = STANDARD_GRAVITY.value if _has_imu(a, b, rig) else None
     yield from _turning(name, "time offset (turning)", offset, 1.0, use, lens, remedy, gravity)

@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from calibkit.data.rig import Camera, Rig
 from calibkit.data.transforms import frames_of
 from calibkit.data.verdict import Status
+from calibkit.errors import BadInputError
 from calibkit.estimation.pixel_grid import grid
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array, hat
@@ -60,13 +61,18 @@ class Shift:
 class Lens:
     """A lens that is known, on the pixels of its image."""
 
+    name: str
     camera: Camera
     params: Array
 
     def rays(self) -> tuple[Array, Array]:
-        """Return pixels over the image and the unit rays that they see; NaN where they see none."""
+        """Return pixels over the image and the unit rays that they see, NaN where they see none; BadInputError where all see none."""
         uv = grid(self.camera.resolution)
-        rays, valid = CAMERAS[self.camera.model].unproject(uv, self.params)
+        with np.errstate(all="ignore"):  # a stranger's file may hold any number
+            rays, valid = CAMERAS[self.camera.model].unproject(uv, self.params)
+        valid &= np.isfinite(rays).all(axis=1)
+        if not valid.any():
+            raise BadInputError(f"{self.name}: no pixel of its image sees anything with these parameters; calibrate it anew")
         return uv, np.where(valid[:, None], rays, np.nan)
 
     def pixels(self, points: Array) -> Array:
@@ -75,10 +81,10 @@ class Lens:
         return np.where((seen.valid & np.isfinite(points).all(axis=-1))[..., None], seen.uv, np.nan)
 
 
-def known_lens(camera: Camera) -> Lens | None:
+def known_lens(name: str, camera: Camera) -> Lens | None:
     """Return the camera's lens, None where a parameter is not observable."""
-    values = [camera.parameters[name].value for name in CAMERAS[camera.model].parameter_names]
-    return None if None in values else Lens(camera, np.array(values, float))
+    values = [camera.parameters[key].value for key in CAMERAS[camera.model].parameter_names]
+    return None if None in values else Lens(name, camera, np.array(values, float))
 
 
 def lens_shifts(old: Lens, new: Lens) -> list[Shift]:
@@ -129,8 +135,6 @@ def _implied(new: Lens, rays: Array, uv: Array, ranges: Sequence[float]) -> Arra
             blocks.append(np.where(seen.valid[:, None, None], J, 0.0)[..., free])
         return np.concatenate(blocks).reshape(-1, blocks[0].shape[-1])
 
-    if not len(rays):
-        return np.eye(4)
     return motion(least_squares(residual, np.zeros(6)[free], jac=jacobian, x_scale="jac", method="lm").x)
 
 
@@ -144,7 +148,7 @@ def transform_shifts(name: str, old: Rig, new: Rig) -> Iterator[Shift]:
     entries = old.transforms[name], new.transforms[name]
     if camera is None or any(entry.status is Status.NOT_OBSERVABLE for entry in entries):
         return
-    before, after = known_lens(old.cameras[camera]), known_lens(new.cameras[camera])
+    before, after = known_lens(camera, old.cameras[camera]), known_lens(camera, new.cameras[camera])
     if before is None or tuple(old.cameras[camera].resolution) != tuple(new.cameras[camera].resolution):
         return
     T_old, T_new = (np.array(entry.matrix) if camera == a else np.array(entry.inverse_matrix) for entry in entries)

@@ -10,15 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaln
-from scipy.stats import chi2 as chi_squared
-from scipy.stats import norm
+from scipy.special import chdtrc, gammaln, ndtri
 
 from calibkit.data.rig import Camera, Imu, ImuIntrinsics, Rig, TimeOffset, Transform
-from calibkit.data.verdict import Status
+from calibkit.errors import one_line
 from calibkit.estimation.model_conversion import convert
 from calibkit.estimation.pixel_grid import grid
 from calibkit.estimation.rig_values import Values, named_as, of_estimates, of_transform
+from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
 
@@ -66,7 +65,7 @@ class EntryChange:
     @property
     def p(self) -> float | None:
         """Return how often chance alone does as much."""
-        return None if self.chi2 is None else float(chi_squared.sf(self.chi2, self.freedom))
+        return None if self.chi2 is None else float(chdtrc(self.freedom, self.chi2))
 
     @property
     def z(self) -> float | None:
@@ -169,9 +168,9 @@ def _sigmas(chi2: float, freedom: int) -> float:
     """Return z with P(|N(0, 1)| > z) = P(chi-squared > chi2); from the leading terms of both tails where p underflows."""
     if freedom == 1:
         return float(np.sqrt(chi2))
-    p = chi_squared.sf(chi2, freedom)
+    p = chdtrc(freedom, chi2)
     if p > 1e-290:
-        return float(norm.isf(p / 2))
+        return float(-ndtri(p / 2))
     log_p = (freedom / 2 - 1) * np.log(chi2 / 2) - chi2 / 2 - gammaln(freedom / 2)
     z = float(np.sqrt(-2 * log_p))
     for _ in range(5):  # 2 phi(z) / z = p
@@ -227,13 +226,8 @@ def _other_model(name: str, old: Camera, new: Camera) -> EntryChange:
 
 
 def _transforms(name: str, old: Transform, new: Transform) -> Iterator[EntryChange]:
-    before = of_transform(old)
-    yield _judged(name, "transform", before, of_transform(new, of_transform(_known(old)).x[3:]))
-
-
-def _known(entry: Transform) -> Transform:
-    """Return the transform with all its numbers, for telling which of two rotation vectors is the nearer."""
-    return entry.model_copy(update={"status": Status.GIVEN, "statuses": {}})
+    r_old = so3.log(np.array(old.matrix)[:3, :3])
+    yield _judged(name, "transform", of_transform(old), of_transform(new, r_old))
 
 
 def _time_offsets(name: str, old: TimeOffset, new: TimeOffset) -> Iterator[EntryChange]:
@@ -266,7 +260,10 @@ def _scale_and_axes(name: str, old: ImuIntrinsics, new: ImuIntrinsics) -> EntryC
 
 def _same_recording(old: Rig, new: Rig) -> tuple[str, ...]:
     """Say so where the two share a recording: their errors are then shared, and the sigma of a change is too large."""
-    files = [{file.sha256: file.name for run in rig.provenance for file in run.inputs if file.sha256 is not None} for rig in (old, new)]
+    files = [
+        {file.sha256: one_line(file.name, 80) for run in rig.provenance for file in run.inputs if file.sha256 is not None}
+        for rig in (old, new)
+    ]
     boards_and_rigs = (".yaml", ".yml")
     shared = [name for digest, name in files[0].items() if digest in files[1] and not name.endswith(boards_and_rigs)]
     if not shared:

@@ -53,7 +53,7 @@ def _shifts(old: Rig, found: Difference) -> Shifts:
         if what == "transform":
             out[name] = list(transform_shifts(name, old, found.new))
         elif name in old.cameras and old.cameras[name].resolution == found.new.cameras[name].resolution:
-            before, after = known_lens(old.cameras[name]), known_lens(found.new.cameras[name])
+            before, after = known_lens(name, old.cameras[name]), known_lens(name, found.new.cameras[name])
             out[name] = [] if before is None or after is None else lens_shifts(before, after)
     return {name: shifts for name, shifts in out.items() if shifts}
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from calibkit.data.plural import counted, plain
 from calibkit.data.verdict import Status
+from calibkit.errors import one_line
 from calibkit.estimation.pixel_shift import Shift
 from calibkit.estimation.rig_difference import FALSE_ALARM, Change, Difference, EntryChange
 from calibkit.estimation.time_offset_result import smear
@@ -117,7 +118,7 @@ def _time(entry: EntryChange, shifts: list[Shift], found: Difference) -> str:
 
 def _largest(entry: EntryChange, shifts: list[Shift], found: Difference) -> str:
     most = max((each for each in entry.parameters if each.z is not None), key=lambda each: abs(each.z or 0.0))
-    return f"{entry.what} changed, {most.name} most: {most.old:.4g} to {most.new:.4g} {most.unit}".rstrip()
+    return f"{entry.what} changed, {most.name} most: {most.old:.4g} to {most.new:.4g} {one_line(most.unit)}".rstrip()
 
 
 _SAID: dict[str, Callable[[EntryChange, list[Shift], Difference], str]] = {

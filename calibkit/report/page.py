@@ -4,6 +4,7 @@ import base64
 import json
 import re
 from collections.abc import Sequence
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
@@ -16,6 +17,8 @@ from calibkit.report.parameters import sigma_note
 from calibkit.report.summary import Summary, about, as_json, camera_lines, limit_cells, stage_lines, stage_tables
 from calibkit.report.view import View
 from calibkit.version import __version__
+
+_SAFE = " !$'*+,-./:;=?@[\\]^_`{|}~"  # quote adds letters and digits
 
 
 def build(summary: Summary, formats: Sequence[str] = ("png",)) -> dict[str, bytes]:
@@ -30,7 +33,7 @@ def build(summary: Summary, formats: Sequence[str] = ("png",)) -> dict[str, byte
                 name = f"pictures/{_slug(view.sensor, view.stage, one.picture.key)}.{form}"
                 images[name] = content
                 pictures.append({"file": name, **what})
-        sections.setdefault(view.name, (view, []))[1].extend((one.picture, _data_uri("image/svg+xml", one.svg)) for one in drawn)
+        sections.setdefault(view.name, (view, []))[1].extend((one.picture, _svg_uri(one.svg)) for one in drawn)
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
@@ -60,6 +63,12 @@ def _template() -> Template:
 
 def _data_uri(mime: str, data: bytes) -> Markup:
     return Markup(f"data:{mime};base64,{base64.b64encode(data).decode()}")  # base64 has nothing to escape
+
+
+def _svg_uri(svg: bytes) -> Markup:
+    """Return an SVG as text, with all that HTML and addresses read otherwise as %XX: a quarter smaller than base64."""
+    text = re.sub(r"\s*\n\s*", " ", svg.decode().replace("base64,\n", "base64,"))
+    return Markup("data:image/svg+xml," + quote(text, safe=_SAFE))
 
 
 def _slug(*parts: str) -> str:

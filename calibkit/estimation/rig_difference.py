@@ -116,19 +116,18 @@ def _judged(name: str, what: str, old: Values, new: Values, notes: tuple[str, ..
     old, new = (values.of(key for key in old.names if key in new.names) for values in (old, new))
     same = old.x.tobytes() == new.x.tobytes() and np.array_equal(old.cov, new.cov)
     cov = old.cov + new.cov
-    sigma = np.sqrt(np.diag(cov))
+    sigma, d = np.sqrt(np.diag(cov)), new.x - old.x
     changes = tuple(
         Change(
             key,
             old.units[i],
             None if np.isnan(old.x[i]) else float(old.x[i]),
             None if np.isnan(new.x[i]) else float(new.x[i]),
-            float(sigma[i]) if sigma[i] > 0 else None,
+            float(sigma[i]) if sigma[i] > 0 and np.isfinite(d[i]) else None,
             _note(key, old, new, i),
         )
         for i, key in enumerate(old.names)
     )
-    d = new.x - old.x
     use = np.array([np.isfinite(d[i]) and sigma[i] > 0 and not key.startswith(_STARTS_ANEW) for i, key in enumerate(old.names)], bool)
     if same:
         return EntryChange(name, what, changes, same=True, notes=(*notes, "the same in both: taken over, not measured anew"))

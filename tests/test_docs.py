@@ -13,7 +13,9 @@ DOCS = ROOT / "docs"
 PAGE = DOCS / "conventions.md"
 
 
-@pytest.mark.parametrize(("name", "examples"), [("conventions.md", 12), ("time_offset.md", 20), ("handeye.md", 18), ("joint.md", 7)])
+@pytest.mark.parametrize(
+    ("name", "examples"), [("conventions.md", 12), ("time_offset.md", 20), ("handeye.md", 18), ("joint.md", 7), ("diff_and_budget.md", 15)]
+)
 def test_the_examples_run(name: str, examples: int) -> None:
     result = doctest.testfile(str(DOCS / name), module_relative=False, optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted >= examples

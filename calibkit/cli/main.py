@@ -23,6 +23,7 @@ COMMANDS: tuple[str, ...] = (
     "handeye",
     "joint",
     "calibrate",
+    "observability",
     "diagnose",
     "report",
     "diff",

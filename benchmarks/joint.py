@@ -79,7 +79,7 @@ def case(duration_s: float) -> dict[str, Any]:
     densities = (imu.gyro_noise_density, imu.gyro_random_walk, imu.accel_noise_density, imu.accel_random_walk)
     noise = ImuNoise(*(None if each is None else each.value for each in densities))
     watch = Stopwatch()
-    for phase, name in (("poses", "board_poses"), ("time offset", "fit_time_offset"), ("fit", "fit_joint")):
+    for phase, name in (("poses", "board_poses"), ("time offset", "fit_time_offset"), ("fit", "fit_best")):
         setattr(whole, name, watch.timed(phase, getattr(whole, name)))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with watch.of("rest"):

@@ -1,6 +1,8 @@
 """What a motion leaves open is named and never given as a number; what it tells is right; rich motion raises no alarm."""
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from calibkit.data.result import Result
 from calibkit.data.verdict import Status, Verdict
 from calibkit.estimation.joint import Joint
 from calibkit.estimation.joint_trust import joint_trust
+from calibkit.simulation import trajectory
+from calibkit.simulation.trajectory import Motion
 
 T, DT = "T_cam0_imu0", "dt_imu0_cam0"
 P, R = ("p_x", "p_y", "p_z"), ("r_x", "r_y", "r_z")
@@ -100,6 +104,34 @@ def test_what_a_motion_leaves_open_is_named(motion: str) -> None:
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_a_motion_leaves_open_is_named_over_many_seeds(motion: str, seed: int) -> None:
     check(motion, seed)
+
+
+def test_a_swing_that_fits_at_two_offsets_has_none() -> None:
+    """A pure sine of 1 Hz and images 2.3 s late: any whole number of periods fits alike."""
+    recording = recorded(0, motion="swing")
+    late = replace(recording, views=replace(recording.views, t_ns=recording.views.t_ns + 2_300_000_000))
+    joint = late.fitted()
+    result = late.result(joint)
+    assert joint.rival is not None
+    assert result.exit_code == 3
+    assert result.rig.time_offsets[DT].offset.value is None
+    assert any(
+        re.match(f"{DT}: not observable: .* fits as well as .*: the motion repeats itself", reason.text) for reason in result.reasons
+    )
+
+
+@pytest.mark.slow
+def test_a_swing_that_fits_at_two_offsets_is_told_apart_by_accelerations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same swing, and moved about without a period: the fits from both offsets tell which is right."""
+    monkeypatch.setitem(trajectory.MOTIONS, "swing", Motion((*trajectory.MOTIONS["swing"].sines, *trajectory.MOTIONS["translation"].sines)))
+    recording = recorded(0, motion="swing")
+    joint = recording.fitted()
+    assert joint.turns[0].second is not None
+    assert joint.rival is None
+    offset = recording.result(joint).rig.time_offsets[DT].offset
+    assert offset.value is not None
+    assert offset.sigma is not None
+    assert abs(offset.value - recording.td) < 4 * offset.sigma
 
 
 def no_alarm(seed: int) -> None:

@@ -7,12 +7,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from joint_samples import Recording, error_of, recorded
+from joint_samples import Recording, error_of, of_camera, recorded
+from numpy.typing import NDArray
 
 from calibkit.data.result import Result
 from calibkit.data.verdict import Verdict
 from calibkit.errors import BadInputError
-from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint import CameraInput, Joint, calibrate_joint
 from calibkit.estimation.joint_trust import joint_trust
 
 Change = Callable[[Recording], Recording]
@@ -27,7 +28,7 @@ def changed(change: Change) -> Callable[[int], Recording]:
     return lambda seed: change(recorded(seed))
 
 
-def only_frames(recording: Recording, keep: slice | list[int]) -> Recording:
+def only_frames(recording: Recording, keep: slice | NDArray[np.intp]) -> Recording:
     rows = np.arange(recording.views.n_frames)[keep]
     return replace(recording, views=recording.views.select(rows))
 
@@ -53,9 +54,35 @@ def gap_of_both(recording: Recording) -> Recording:
     return replace(recording, imu=imu, views=recording.views.select(np.flatnonzero((frames < 10.2) | (frames > 11.2))))
 
 
+def frozen(recording: Recording, sensors: tuple[str, ...], start: float, end: float) -> Recording:
+    """Sensors of the IMU that keep one value from start to end, s."""
+    t, imu = (recording.imu.t_ns - recording.imu.t_ns[0]) * 1e-9, recording.imu
+    rows = np.flatnonzero((t >= start) & (t < end))
+    values = {sensor: getattr(imu, sensor).copy() for sensor in sensors}
+    for value in values.values():
+        value[rows] = value[rows[0]]
+    return replace(recording, imu=replace(imu, **values))
+
+
+def dead_axis(recording: Recording) -> Recording:
+    gyro = recording.imu.gyro * [1.0, 1.0, 0.0]
+    return replace(recording, imu=replace(recording.imu, gyro=gyro))
+
+
+def one_in_fifty_lost(recording: Recording) -> Recording:
+    return only_frames(recording, np.flatnonzero(np.random.default_rng(recording.session.seed).random(recording.views.n_frames) > 0.02))
+
+
+def without_images(recording: Recording, start: float, end: float) -> Recording:
+    t = (recording.views.t_ns - recording.imu.t_ns[0]) * 1e-9
+    return only_frames(recording, np.flatnonzero((t < start) | (t > end)))
+
+
 SWAP: list[list[float]] = [[0, 1, 0], [1, 0, 0], [0, 0, 1]]
 FLIP: list[list[float]] = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
 EYE: list[list[float]] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+
+STUCK = "gave one and the same value, 1 time of up to 2 s, the longest 10 s in: frozen"
 
 # What a recording suffers, and what may be said beside the right answer ("" nothing).
 SURVIVED: dict[str, tuple[Callable[[int], Recording], tuple[str, ...]]] = {
@@ -65,13 +92,23 @@ SURVIVED: dict[str, tuple[Callable[[int], Recording], tuple[str, ...]]] = {
     "one acceleration of 400": (fault("accel-spike"), ()),
     "one stamp 50 ms off": (fault("image-stamp"), ("stamp",)),
     "one zero stamp": (fault("zero-stamp"), ("stamp of zero", "outside of what imu0 recorded")),
-    "3 s without images": (fault("image-gap"), ("of the frames are missing",)),
+    "3 s without images": (fault("image-gap"), ("cam0 has 1 gap of up to 3 s, the longest 13.47 s in", "of the frames are missing")),
+    "1.2 s without images": (changed(partial(without_images, start=20, end=21.2)), ("cam0 has 1 gap of up to 1.2 s, the longest 19.9",)),
+    "0.8 s without images": (changed(partial(without_images, start=20, end=20.8)), ()),
+    "one frame in fifty lost": (changed(one_in_fifty_lost), ()),
     "half a second without IMU": (fault("imu-gap"), ()),
     "a second without both": (changed(gap_of_both), ("gap of up to 1 s",)),
     "a large bias": (changed(partial(gyro, M=EYE, bias=(0.5, -0.4, 0.3))), ()),
     "4 Hz": (changed(partial(only_frames, keep=slice(None, None, 5))), ()),
     "lost frames": (fault("image-drops-30"), ("of the frames are missing",)),
     "2 ms of jitter": (fault("image-jitter-2"), ("jitter",)),
+    "IMU frozen for 2 s": (
+        changed(partial(frozen, sensors=("gyro", "accel"), start=10, end=12)),
+        (f"imu0's gyroscope and accelerometer {STUCK}",),
+    ),
+    "gyroscope frozen for 2 s": (changed(partial(frozen, sensors=("gyro",), start=10, end=12)), (f"imu0's gyroscope {STUCK}",)),
+    "accelerometer frozen for 2 s": (changed(partial(frozen, sensors=("accel",), start=10, end=12)), (f"imu0's accelerometer {STUCK}",)),
+    "IMU frozen for 0.3 s": (changed(partial(frozen, sensors=("gyro", "accel"), start=10, end=10.3)), ()),
 }
 # What it suffers, and how the first reason names it.
 NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
@@ -100,16 +137,34 @@ ALIKE = {
     "4 Hz",
     "2 ms of jitter",
     "lost frames",
-    "3 s without images",
     "tag spacing",
     "gyroscope's axes swapped",
     "gyroscope's axis flipped",
     "accelerometer's axes swapped",
+    "1.2 s without images",
+    "0.8 s without images",
+    "one frame in fifty lost",
+    "gyroscope frozen for 2 s",
+    "accelerometer frozen for 2 s",
+    "IMU frozen for 0.3 s",
 }
 REFUSED: dict[str, tuple[Callable[[int], Recording], str]] = {
     "gyroscope in deg/s": (fault("gyro-in-deg"), "--gyro-unit deg/s"),
     "4 images": (changed(partial(only_frames, keep=slice(0, None, 150))), "4 of .* images of cam0 show the board"),
     "all stamps zero": (fault("zero-stamps"), "no stamps"),
+    "gyroscope frozen": (
+        changed(partial(frozen, sensors=("gyro",), start=0, end=99)),
+        "the gyroscope gives one and the same value throughout",
+    ),
+    "accelerometer frozen": (
+        changed(partial(frozen, sensors=("accel",), start=0, end=99)),
+        "the accelerometer gives one and the same value",
+    ),
+    "IMU frozen but for 3 s": (
+        changed(partial(frozen, sensors=("gyro", "accel"), start=3, end=99)),
+        "gyroscope and the accelerometer repeat one value through 90 % of the recording",
+    ),
+    "an axis that is not filled": (changed(dead_axis), "the gyroscope's z axis gives one and the same value throughout"),
 }
 
 
@@ -138,6 +193,32 @@ def names(name: str, seed: int) -> None:
     assert result.exit_code != 0
     fails = [reason.text for reason in result.reasons if reason.verdict is Verdict.FAIL]
     assert re.match(cause, fails[0]), fails
+
+
+def lens_of_fronto_parallel_views(seed: int, sigmas: float = 3.0) -> None:
+    """Where images alone do not tell the lens, accelerations do: from a focal length that is 11 % too long, all are right."""
+    recording = recorded(seed, motion="fronto-parallel")
+    camera = recording.camera.camera
+    parameters = {
+        name: each.model_copy(update={"value": (each.value or 0) * 1.11}) for name, each in camera.parameters.items() if name[0] == "f"
+    }
+    wrong = camera.model_copy(update={"parameters": {**camera.parameters, **parameters}})
+    joint = calibrate_joint([CameraInput(recording.views, wrong)], recording.imu, recording.noise)
+    where, cov = of_camera(joint, joint_trust(joint.fit))
+    z, sigma = error_of(recording, joint)[where] / np.sqrt(np.diag(cov)), np.sqrt(np.diag(cov))
+    assert np.abs(z).max() < sigmas, z.round(2)
+    assert sigma[7:9].max() < 0.5  # px
+    assert all("is weak" in reason.text for reason in recording.result(joint).reasons)
+
+
+def test_nearly_fronto_parallel_views_tell_the_lens_by_the_imu() -> None:
+    lens_of_fronto_parallel_views(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 10))
+def test_nearly_fronto_parallel_views_over_many_seeds(seed: int) -> None:
+    lens_of_fronto_parallel_views(seed, 3.7)
 
 
 def some(names: Iterable[str]) -> list[object]:

@@ -14,11 +14,14 @@ from calibkit.errors import BadInputError
 from calibkit.estimation.board_poses import BoardPoses, board_poses
 from calibkit.estimation.board_turns import turns_of_board
 from calibkit.estimation.camera_problem import CameraViews
-from calibkit.estimation.joint_fit import JointFit, fit_joint
+from calibkit.estimation.joint_fit import JointFit
+from calibkit.estimation.joint_frozen import Frozen, without_frozen
 from calibkit.estimation.joint_knots import ORDER, Fineness, fineness
 from calibkit.estimation.joint_noise import sample_sigmas
 from calibkit.estimation.joint_problem import Frames, GravityPrior, ImuRows, JointProblem
-from calibkit.estimation.joint_seed import CameraSeed, Posed, camera_beside, seed_camera, seed_trajectory
+from calibkit.estimation.joint_rivals import Rival, fit_best
+from calibkit.estimation.joint_seed import CameraSeed, Posed, camera_beside, rival_seeds, seed_camera, seed_trajectory
+from calibkit.estimation.joint_state import JointState
 from calibkit.estimation.lens_fit import dense_views, rows_of
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
@@ -81,6 +84,8 @@ class Joint:
     rate_hz: float
     densities_told: tuple[bool, bool]  # white noise of gyroscope and accelerometer
     walks_told: tuple[bool, bool]
+    frozen: tuple[Frozen, ...] = ()  # of the IMU, left out
+    rival: Rival | None = None  # another solution that fits as well, where motion repeats itself
 
     @property
     def frames_left_out(self) -> int:
@@ -100,30 +105,79 @@ def calibrate_joint(
 
 
 def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise, settings: Settings, progress: Progress) -> Joint:
-    measured = imu.select(in_order(imu.t_ns))
+    measured, frozen = without_frozen(imu.select(in_order(imu.t_ns)))
     accel, gyro = settings.imu.correct(measured.accel, measured.gyro)
     imu = replace(measured, accel=accel, gyro=gyro)  # near enough for the start
     poses = [_posed(each) for each in progress(cameras, "board poses", len(cameras))]
-    turns = [fit_time_offset(turns_of_board(each), imu, TurnSettings()) for each in progress(poses, "time offset", len(poses))]
-    seeds = [seed_camera(pose, turn, imu) for pose, turn in zip(poses, turns, strict=True)]
-    origin = turns[0].alignment.track.origin_ns
-    t = (imu.t_ns - origin) * 1e-9
-    times = [np.asarray((each.t_ns - origin) * 1e-9, np.float64) for each in poses]
+    turned = [turns_of_board(each) for each in poses]
+    turns = [fit_time_offset(each, imu, TurnSettings()) for each in progress(turned, "time offset", len(poses))]
+    seeds = tuple(seed_camera(pose, turn, imu) for pose, turn in zip(poses, turns, strict=True))
+    recorded = _Recorded(tuple(cameras), tuple(poses), turns[0].alignment.track.origin_ns, measured, imu, noise, settings)
+    begun = [_begin(recorded, seeds), *(_begin(recorded, each) for each in rival_seeds(poses, turned, turns, imu, seeds))]
+    fit, best, rival = fit_best([(each.problem, each.start) for each in begun])
+    chosen = begun[best]
+    told = (noise.gyro_noise_density is not None, noise.accel_noise_density is not None)
+    walks = (noise.gyro_random_walk is not None, noise.accel_random_walk is not None)
+    return Joint(
+        fit,
+        recorded.origin_ns,
+        recorded.poses,
+        tuple(turns),
+        chosen.seeds,
+        chosen.used,
+        chosen.fineness,
+        chosen.rate_hz,
+        told,
+        walks,
+        frozen,
+        rival,
+    )
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """What was recorded, and where each camera had the board."""
+
+    cameras: tuple[CameraInput, ...]
+    poses: tuple[BoardPoses, ...]
+    origin_ns: int
+    measured: ImuSamples
+    imu: ImuSamples  # its scale and axes as known so far corrected
+    noise: ImuNoise
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """The problem of a start, and the start."""
+
+    seeds: tuple[CameraSeed, ...]
+    problem: JointProblem
+    start: JointState
+    used: tuple[Array, ...]  # per camera: rows of its views that take part
+    fineness: Fineness
+    rate_hz: float
+
+
+def _begin(recorded: _Recorded, seeds: tuple[CameraSeed, ...]) -> _Begun:
+    cameras, imu, settings = recorded.cameras, recorded.imu, recorded.settings
+    t = (imu.t_ns - recorded.origin_ns) * 1e-9
+    times = [np.asarray((each.t_ns - recorded.origin_ns) * 1e-9, np.float64) for each in recorded.poses]
     seen = [at + seed.td for at, seed in zip(times, seeds, strict=True)]
     low = max(t[0], min(each.min() for each in seen) - 2 * _MARGIN_S)
     high = min(t[-1], max(each.max() for each in seen) + 2 * _MARGIN_S)
     if high - low < _LEAST_S:
         raise BadInputError("cameras and IMU share too little time: record both at once, 10 s or more")
     inside = (t >= low) & (t <= high)
-    rates = np.concatenate([measured.gyro, measured.accel], axis=1)[inside]
+    rates = np.concatenate([recorded.measured.gyro, recorded.measured.accel], axis=1)[inside]
     fine = fineness(t[inside], rates)
     spacing = settings.spacing or fine.chosen
     knots = Knots(float(low), spacing, ORDER, int(np.ceil((high - low) / spacing)))
     rate_hz = float(1 / np.median(np.diff(t[inside])))
-    rows = ImuRows(t[inside], rates[:, :3], rates[:, 3:], *_noise(noise, rates, rate_hz), np.ones((len(rates), 2), bool))
+    rows = ImuRows(t[inside], rates[:, :3], rates[:, 3:], *_noise(recorded.noise, rates, rate_hz), np.ones((len(rates), 2), bool))
 
     start, grids, used = None, [], []
-    for each, pose, at, seed in zip(cameras, poses, times, seeds, strict=True):
+    for each, pose, at, seed in zip(cameras, recorded.poses, times, seeds, strict=True):
         inner = (at + seed.td > low + _MARGIN_S) & (at + seed.td < high - _MARGIN_S)
         grids.append(Frames(at[inner], _grid(each, pose.frame[inner]), each.views.sigma_bias_px))
         used.append(pose.frame[inner])
@@ -149,10 +203,7 @@ def _calibrate(cameras: Sequence[CameraInput], imu: ImuSamples, noise: ImuNoise,
     start = replace(
         start, imu=settings.imu, cameras=tuple(replace(x, line_delay=delay) for x, delay in zip(start.cameras, delays, strict=True))
     )
-    fit = fit_joint(problem, start)
-    told = (noise.gyro_noise_density is not None, noise.accel_noise_density is not None)
-    walks = (noise.gyro_random_walk is not None, noise.accel_random_walk is not None)
-    return Joint(fit, origin, tuple(poses), tuple(turns), tuple(seeds), tuple(used), fine, rate_hz, told, walks)
+    return _Begun(seeds, problem, start, tuple(used), fine, rate_hz)
 
 
 def _posed(each: CameraInput) -> BoardPoses:

@@ -7,6 +7,7 @@ import numpy as np
 
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.estimation.joint import Joint
+from calibkit.estimation.joint_frozen import WORDS
 from calibkit.estimation.joint_problem import JointProblem
 from calibkit.estimation.joint_state import JointState
 from calibkit.estimation.stamps import StampReport
@@ -14,7 +15,6 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Steps, basis, turning
 
-WORDS = {"gyro": "gyroscope", "accel": "accelerometer"}
 _UNITS = {"gyro": {"deg/s": 180 / np.pi}, "accel": {"g": 1 / 9.80665, "mg": 1000 / 9.80665}}  # what a reading in it is over one in SI
 _NOISY = 3.0  # real over stated sigma
 _EXPLAINED = 0.8  # of what a sensor reads must come from the others' motion by one matrix

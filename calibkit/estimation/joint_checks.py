@@ -8,10 +8,10 @@ from threadpoolctl import threadpool_limits
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
 from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import LINE, LINE_SCALE, SCALE, JointState, model_step
+from calibkit.estimation.joint_rivals import border_step
+from calibkit.estimation.joint_state import LINE, LINE_SCALE, SCALE, JointState
 from calibkit.estimation.joint_trust import border_scales, joint_covariance
 from calibkit.estimation.lens_fit import rows_of
-from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
 from calibkit.solver.levenberg_marquardt import minimise
@@ -74,7 +74,7 @@ def _halves(fit: JointFit) -> Halves | None:
         return None
     scales = border_scales(fit)
     covs = [joint_covariance(half, scales).corrected for half in halves]
-    off = _difference(halves[0], halves[1])
+    off = border_step(halves[0], halves[1])
     z = off / np.sqrt(np.diag(covs[0]) + np.diag(covs[1]))
     z[fit.problem.border["gravity"]] = 0
     first, second = halves
@@ -87,22 +87,6 @@ def _halves(fit: JointFit) -> Halves | None:
 
 def _with_calibration(x: JointState, of: JointState) -> JointState:
     return replace(x, cameras=of.cameras, gravity=of.gravity, board_scale=of.board_scale, imu=of.imu)
-
-
-def _difference(a: JointFit, b: JointFit) -> Array:
-    """Return the step of the border from a to b."""
-    border = a.problem.border
-    out = np.zeros(border.size)
-    for name, step in model_step(a.x.imu, b.x.imu).items():
-        if name in border.extras:
-            out[border[name]] = step
-    for c, (one, two) in enumerate(zip(a.x.cameras, b.x.cameras, strict=True)):
-        out[border[f"T {c}"]] = se3.local(one.T_cam_imu, two.T_cam_imu)
-        out[border[f"dt {c}"]] = two.dt - one.dt
-        out[border[f"lens {c}"]] = two.lens - one.lens
-        if LINE in border.extras:
-            out[border[f"{LINE} {c}"]] = (two.line_delay - one.line_delay) / LINE_SCALE
-    return out
 
 
 def _rms(problem: JointProblem, x: JointState, c: int) -> float:

@@ -40,8 +40,19 @@ class JointFit:
     steps: int
 
 
-def fit_joint(problem: JointProblem, x: JointState) -> JointFit:
-    """Return the maximum-likelihood trajectory and calibration from a start."""
+@dataclass(frozen=True)
+class RoughFit:
+    """Where the robust fit ends."""
+
+    problem: JointProblem  # weights as found
+    x: JointState
+    found: tuple[Array, ...]  # (f, n) per camera: weights as the detector has them
+    factors: dict[str, float]  # real sigma over the stated one, by kind
+    steps: int
+
+
+def fit_roughly(problem: JointProblem, x: JointState) -> RoughFit:
+    """Return the robust fit from a start."""
     found = tuple(frames.views.weight for frames in problem.cameras)
     factors: dict[str, float] = {}
     # Wide open first: the seed's IMU sits in the camera.
@@ -54,19 +65,25 @@ def fit_joint(problem: JointProblem, x: JointState) -> JointFit:
         problem = _rescaled(problem, scales, factors)
         solution = minimise(replace(problem, loss_scale=_LOSS), solution.x, max_steps=6, tolerance=1e-4)
         steps += solution.steps
-    problem = _without_outliers(problem, solution.x, found, factors)
+    return RoughFit(problem, solution.x, found, factors, steps)
+
+
+def refine(rough: RoughFit) -> JointFit:
+    """Return the maximum-likelihood trajectory and calibration without what the robust fit gave up."""
+    found, factors, steps, x = rough.found, dict(rough.factors), rough.steps, rough.x
+    problem = _without_outliers(rough.problem, x, found, factors)
     for rest in reversed(range(_ROUNDS)):
-        solution = minimise(problem, solution.x, max_steps=20, tolerance=_TIGHT)
-        steps += solution.steps
-        parts = list(problem.parts(solution.x))
-        _, system = problem.assembled(parts, solution.x)
+        solution = minimise(problem, x, max_steps=20, tolerance=_TIGHT)
+        x, steps = solution.x, steps + solution.steps
+        parts = list(problem.parts(x))
+        _, system = problem.assembled(parts, x)
         drawn = draw(system, DRAWS)
         spent = components(parts, drawn)
         scales = {kind: part.factor for kind, part in spent.items() if kind not in ("walk", "stays")}
         if not rest or _settled(scales):
             break
         problem = _rescaled(problem, scales, factors)
-    return JointFit(problem, solution.x, system, drawn, tuple(weight > 0 for weight in found), factors, spent, solution.converged, steps)
+    return JointFit(problem, x, system, drawn, tuple(weight > 0 for weight in found), factors, spent, solution.converged, steps)
 
 
 def _settled(scales: dict[str, float]) -> bool:

@@ -15,6 +15,7 @@ from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_fit import corner_residuals
 from calibkit.estimation.joint_imu import ImuInput, intrinsics_of
 from calibkit.estimation.joint_noise import draw
+from calibkit.estimation.joint_rivals import spread
 from calibkit.estimation.joint_state import BIASES, KNOT, LINE, LINE_SCALE
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.joint_verdict import Judged, judge_joint, known
@@ -39,6 +40,7 @@ def joint_result(
     before: Imu | None = None,
 ) -> Result:
     """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera; `before` is the rig file's entry of the IMU."""
+    trust = spread(trust, joint.rival)
     names = tuple(each.views.camera for each in cameras)
     judged = judge_joint(joint, trust, checks, cameras, imu, of_imu, stamps)
     fit, border = joint.fit, joint.fit.problem.border

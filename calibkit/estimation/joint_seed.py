@@ -1,5 +1,6 @@
 """Where the joint estimator starts: rotation, offset and bias by how both turn, what that leaves open by how both accelerate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,16 +9,20 @@ from calibkit.data.observations import ImuSamples
 from calibkit.data.verdict import Status
 from calibkit.estimation.alignment_axes import open_axes
 from calibkit.estimation.board_poses import BoardPoses
-from calibkit.estimation.joint_accelerations import camera_accelerations, lag_of, rotation_of, turned_about
+from calibkit.estimation.joint_accelerations import Accelerations, camera_accelerations, lag_of, rotation_of, turned_about
 from calibkit.estimation.joint_state import CameraState, JointState
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.time_offset import TimeOffsetFit
+from calibkit.estimation.time_offset_start import find_starts
 from calibkit.estimation.time_offset_verdict import judge_time_offset
+from calibkit.estimation.turns import Turns
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots, basis
 
 TURNS, ACCELERATIONS, STAMPS = "turns", "accelerations", "stamps"
+_APART_S, _RIVALS = 0.05, 3  # offsets that far apart are two; so many others are tried
+_MOST = 0.5  # of the frames
 
 
 @dataclass(frozen=True)
@@ -33,29 +38,74 @@ class CameraSeed:
 
 def seed_camera(poses: BoardPoses, fit: TimeOffsetFit, imu: ImuSamples) -> CameraSeed:
     """Return rotation and offset by turns, and what those leave open by accelerations."""
-    R, td, origin_ns = fit.alignment.R, fit.td, fit.alignment.track.origin_ns
     judged = judge_time_offset("dt", "cam", "imu", fit, {})
     axes = open_axes(fit.alignment)
     known = judged.status is not Status.NOT_OBSERVABLE or judged.coarse
+    by_turns = CameraSeed(fit.alignment.R, fit.td, fit.gyro_bias, fit.alignment.track, TURNS)
     if known and not len(axes):
-        return CameraSeed(R, td, fit.gyro_bias, fit.alignment.track, TURNS)
-    imu_t = np.asarray((imu.t_ns - origin_ns) * 1e-9, np.float64)
-    camera = camera_accelerations(poses, origin_ns, len(axes) < 3)
-    td_by = TURNS
+        return by_turns
+    track = fit.alignment.track
+    camera = camera_accelerations(poses, track.origin_ns, len(axes) < 3)
+    td, td_by = fit.td, TURNS
     if not known:
-        lag = None if camera is None else lag_of(camera, imu_t, imu)
+        lag = None if camera is None else lag_of(camera, _seconds(imu, track), imu)
         td_by = STAMPS if lag is None else ACCELERATIONS
         td = lag if lag is not None else 0.0 if _overlap(poses, imu) else td
-    found = None
-    if camera is not None:
-        found = turned_about(camera, imu_t, imu, td, R, axes[0]) if len(axes) == 1 else rotation_of(camera, imu_t, imu, td)
-    return CameraSeed(R if found is None else found, td, fit.gyro_bias, fit.alignment.track, td_by)
+    return _turned(replace(by_turns, td=td, td_by=td_by), camera, axes, imu)
 
 
-def _overlap(poses: BoardPoses, imu: ImuSamples) -> bool:
-    """Whether most frames lie within the IMU's samples by their stamps."""
-    inside = (poses.t_ns > imu.t_ns[0]) & (poses.t_ns < imu.t_ns[-1])
-    return float(np.mean(inside)) > 0.5
+def _turned(seed: CameraSeed, camera: Accelerations | None, axes: Array, imu: ImuSamples) -> CameraSeed:
+    """Return a start whose rotation is, about the axes that turns leave open, that of the accelerations."""
+    if camera is None or not len(axes):
+        return seed
+    t = _seconds(imu, seed.track)
+    one = len(axes) == 1
+    R = turned_about(camera, t, imu, seed.td, seed.R_cam_imu, axes[0]) if one else rotation_of(camera, t, imu, seed.td)
+    return seed if R is None else replace(seed, R_cam_imu=R)
+
+
+def _seconds(imu: ImuSamples, track: OrientationTrack) -> Array:
+    return np.asarray((imu.t_ns - track.origin_ns) * 1e-9, np.float64)
+
+
+def rival_seeds(
+    poses: Sequence[BoardPoses], turned: Sequence[Turns], fits: Sequence[TimeOffsetFit], imu: ImuSamples, seeds: tuple[CameraSeed, ...]
+) -> list[tuple[CameraSeed, ...]]:
+    """Return other starts for all cameras at once, where motion repeats itself and turns alone do not tell which offset is right."""
+    if not any(_doubtful(*each, imu) for each in zip(poses, fits, strict=True)):
+        return []
+    found = [_rivals(*each, imu) for each in zip(poses, turned, fits, strict=True)]
+    first = seeds[0]
+    shifts = [other for other in found[0] if abs(other.td - first.td) > _APART_S][:_RIVALS]
+    beside = list(zip(seeds[1:], found[1:], strict=True))
+    return [(other, *(_nearest([seed, *own], seed.td + other.td - first.td) for seed, own in beside)) for other in shifts]
+
+
+def _nearest(seeds: list[CameraSeed], td: float) -> CameraSeed:
+    return min(seeds, key=lambda seed: abs(seed.td - td))
+
+
+def _rivals(poses: BoardPoses, turned: Turns, fit: TimeOffsetFit, imu: ImuSamples) -> list[CameraSeed]:
+    """Return a start for each offset at which turns are alike, the best one first."""
+    track, axes = fit.alignment.track, open_axes(fit.alignment)
+    camera = camera_accelerations(poses, track.origin_ns, len(axes) < 3) if len(axes) else None
+    out = [CameraSeed(fit.alignment.R, fit.td, fit.gyro_bias, track, TURNS)]
+    for start in find_starts(turned, track, None):
+        td = start.coarse_ns * 1e-9
+        if len(start.R) == 3 and all(abs(td - other.td) > _APART_S for other in out) and _overlap(poses, imu, td):
+            out.append(replace(out[0], R_cam_imu=start.R, td=td))
+    return [_turned(each, camera, axes, imu) for each in out]
+
+
+def _doubtful(poses: BoardPoses, fit: TimeOffsetFit, imu: ImuSamples) -> bool:
+    """Whether turns fit at another offset, or lay streams that by their stamps lie side by side mostly apart."""
+    return fit.second is not None or (_overlap(poses, imu) and not _overlap(poses, imu, fit.td))
+
+
+def _overlap(poses: BoardPoses, imu: ImuSamples, td: float = 0.0) -> bool:
+    """Whether most frames lie within the IMU's samples at an offset."""
+    t_ns = poses.t_ns + round(td * 1e9)
+    return float(np.mean((t_ns > imu.t_ns[0]) & (t_ns < imu.t_ns[-1]))) > _MOST
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.estimation.joint import CameraInput, Joint
-from calibkit.estimation.joint_causes import WORDS, jittering, wrong_sensors
+from calibkit.estimation.joint_causes import jittering, wrong_sensors
 from calibkit.estimation.joint_checks import Checks
+from calibkit.estimation.joint_frozen import WORDS
+from calibkit.estimation.joint_gaps import gaps_of_camera, gaps_of_imu
 from calibkit.estimation.joint_imu import ImuInput
-from calibkit.estimation.joint_seed import STAMPS
 from calibkit.estimation.joint_state import A_G, IMU_MODEL, LINE, M_A, M_G, PHI
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
@@ -26,7 +27,7 @@ _GRAVITY_OFF = 4.0  # sigmas of what was told
 _SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
 _HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
 _MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
-_OTHER_CLOCK_S, _GAP_S = 1.0, 0.9
+_OTHER_CLOCK_S = 1.0
 _READOUT_S = 5e-4  # of an image: less costs 0.25 px at the first and the last row at a fast 1 rad/s
 _ODD_SCALE = 1.25  # a scale farther from 1 is no sensor's error
 _IMU_MENDS = {
@@ -77,6 +78,8 @@ def judge_joint(
         size = f"its sigma would be {sigma[k] * trust.scales[k] * 1e3:.2g} ms"
         known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
         reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
+        if joint.rival is not None:
+            reasons[dt] = (_of_rival(dt, fit.x.cameras[c].dt, joint.rival.offsets[c]),)
         rolls = _of_shutter(joint, checks, name, c)
         judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
         if statuses[k] is not Status.NOT_OBSERVABLE:
@@ -84,7 +87,7 @@ def judge_joint(
             reasons[dt] += (*_of_offset(joint, c, dt, name, imu), *judged.clock, *turns, *judged.stamps)
         cause = jitter[c]  # what follows from it, or from a shutter, is not told
         corners = rolls or (_of_corners(joint, names, c) if cause is None else (cause,))
-        reasons[name] = (*_of_lens(joint, trust, cameras[c], c), *corners)
+        reasons[name] = (*_of_lens(joint, trust, cameras[c], c), *corners, *gaps_of_camera(joint, c, name))
         if cause is not None:
             reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
     reasons[imu] = _of_imu(joint, statuses, imu, of_imu)
@@ -104,11 +107,12 @@ def _of_offset(joint: Joint, c: int, dt: str, name: str, imu: str) -> tuple[Reas
     if abs(size) > _OTHER_CLOCK_S:
         text = f"{dt}: {size:.3f} s is more than any delay: {name} and {imu} have clocks of different origins"
         found.append(Reason(Verdict.CHECK, f"{text}: it will be another one at the next start"))
-    second = joint.turns[c].second
-    if joint.seeds[c].td_by == STAMPS and second is not None:
-        text = f"{dt}: {second * 1e3:+.1f} ms may fit as well as {size * 1e3:+.1f} ms: the motion repeats itself; turn irregularly"
-        found.append(Reason(Verdict.FAIL, text))
     return tuple(found)
+
+
+def _of_rival(dt: str, one: float, other: float) -> Reason:
+    both = f"{other * 1e3:+.1f} ms fits as well as {one * 1e3:+.1f} ms"
+    return Reason(Verdict.FAIL, f"{dt}: not observable: {both}: the motion repeats itself; turn irregularly, about several axes")
 
 
 def _open_text(each: Open) -> str:
@@ -207,12 +211,7 @@ def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool) -> tuple[Reaso
     else:
         found += [reason for i, kind in enumerate(WORDS) if not jitter for reason in _of_samples(joint, i, kind, imu)]
         found += _of_scale(joint, checks, imu)
-    gap = np.diff(fit.problem.imu.t)
-    if gap.max() > _GAP_S:
-        at = fit.problem.imu.t[int(np.argmax(gap))]
-        many = counted(int(np.sum(gap > _GAP_S)), "gap")
-        text = f"{imu} has {many} of up to {gap.max():.2g} s, the longest {at:.4g} s in: images alone hold the trajectory there"
-        found.append(Reason(Verdict.CHECK, text))
+    found += gaps_of_imu(joint, imu)
     if not np.all(joint.walks_told):
         text = f"{imu} has no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
         found.append(Reason(Verdict.CHECK, text))

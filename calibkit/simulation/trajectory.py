@@ -103,6 +103,18 @@ MOTIONS: dict[str, Motion] = {
             *_SHAKE[:3],
         )
     ),
+    # All views are within 3 deg of one attitude: images alone hardly tell the lens.
+    "fronto-parallel": Motion(
+        (
+            (0.13, 0.30, 0, 0, 0, 0, 0),
+            (0.19, 0, 0.22, 0, 0, 0, 0),
+            (0.23, 0, 0, 0.25, 0, 0, 0),
+            *_SHAKE[:3],
+            (0.83, 0, 0, 0, 0.02, 0, 0),
+            (0.71, 0, 0, 0, 0, 0.02, 0),
+            (0.62, 0, 0, 0, 0, 0, 0.02),
+        )
+    ),
     "single-axis": Motion(((0.23, 0, 0, 0, 0, 0.30, 0), (0.71, 0, 0, 0, 0, 0.12, 0))),
     # About the optical axis, so that the board stays in view: a swing that repeats itself, and a turn at one rate for ever.
     "swing": Motion(((1.0, 0, 0, 0, 0, 0, 0.25),)),

@@ -43,17 +43,12 @@ def run(
     paid for, are named with size and sigma: clock, mount, lens, board, IMU, and what drifts. By chance alone one is named in 1 of 100
     recordings. Exit code 0: it fits; 1: a cause is found; 2: bad input.
     """
-    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
-    from calibkit.errors import one_line
-    from calibkit.io.atomic import refuse_unwritable, write_json
+    from calibkit.cli.shown import tell
     from calibkit.io.imu_options import ImuOptions
-    from calibkit.io.rig_file import load_rig, merge_rigs
     from calibkit.stages.diagnose import Options, run_diagnosis
 
-    refuse_clashes([*sources, target, *rig, *([temperature] if temperature else [])], [json_file])
-    if json_file is not None:
-        refuse_unwritable(json_file, force)
+    known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force)
     asked = Options(
         cameras=tuple(camera or ()),
         imu=imu,
@@ -63,11 +58,4 @@ def run(
         ros_distro=ros_distro,
         temperature=temperature,
     )
-    found = run_diagnosis(sources, target, merge_rigs([(path, load_rig(path)) for path in rig]), asked, bar)
-    for warning in found.warnings:
-        typer.echo(f"warning: {one_line(warning)}", err=True)
-    typer.echo(found.text)
-    if json_file is not None:
-        write_json(json_file, found.as_json(), force)
-        typer.echo(f"written: {one_line(json_file)}")
-    raise typer.Exit(found.exit_code)
+    tell(run_diagnosis(sources, target, known, asked, bar), json_file, force)

@@ -25,6 +25,7 @@ COMMANDS: tuple[str, ...] = (
     "calibrate",
     "observability",
     "diagnose",
+    "validate",
     "report",
     "diff",
     "budget",

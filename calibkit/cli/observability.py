@@ -38,18 +38,13 @@ def run(
     The sigma that each number would have, what stays open, and which simple motion to add, the most useful first. For between two takes: no
     calibration is written. Exit code 0: all is observable; 2: bad input; 3: something is not.
     """
-    from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
-    from calibkit.errors import one_line
-    from calibkit.io.atomic import refuse_unwritable, write_json
+    from calibkit.cli.shown import tell
     from calibkit.io.imu_options import ImuOptions
-    from calibkit.io.rig_file import load_rig, merge_rigs
     from calibkit.stages.camera_imu import Sensors
     from calibkit.stages.observability import observability
 
-    refuse_clashes([*sources, target, *rig], [json_file])
-    if json_file is not None:
-        refuse_unwritable(json_file, force)
+    known = options.tested([*sources, target], rig, json_file, force)
     asked = Sensors(
         cameras=tuple(camera or ()),
         imu=imu,
@@ -58,11 +53,4 @@ def run(
         cache=not no_cache,
         ros_distro=ros_distro,
     )
-    found = observability(sources, target, merge_rigs([(path, load_rig(path)) for path in rig]), asked, bar)
-    for warning in found.warnings:
-        typer.echo(f"warning: {one_line(warning)}", err=True)
-    typer.echo(found.text)
-    if json_file is not None:
-        write_json(json_file, found.as_json(), force)
-        typer.echo(f"written: {one_line(json_file)}")
-    raise typer.Exit(found.exit_code)
+    tell(observability(sources, target, known, asked, bar), json_file, force)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from calibkit.data.rig import Rig
     from calibkit.models.imu import Gravity
     from calibkit.stages.outputs import Outputs
 
@@ -62,6 +63,23 @@ def outputs_of(
     refuse_clashes(inputs, [out, report, json_file, *others])
     refuse_clashes(rigs or (), [report, json_file, *others])  # OUT may be a rig: it is then updated
     return Outputs(out, report, json_file, tuple(rigs or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
+
+
+def tested(
+    inputs: Iterable[Path],
+    rigs: list[Path],
+    json_file: Path | None,
+    force: bool,
+) -> "Rig":
+    """Return the merged rigs that are tested, before long work; BadInputError where the only output is an input or exists."""
+    from calibkit.cli.paths import refuse_clashes
+    from calibkit.io.atomic import refuse_unwritable
+    from calibkit.io.rig_file import load_rig, merge_rigs
+
+    refuse_clashes([*inputs, *rigs], [json_file])
+    if json_file is not None:
+        refuse_unwritable(json_file, force)
+    return merge_rigs([(path, load_rig(path)) for path in rigs])
 
 
 def size_of(text: str | None) -> tuple[int, int] | None:

@@ -1,6 +1,7 @@
 """How a stage ends on the terminal: warnings, the numbers, the verdict, the files; then the exit code."""
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import typer
 
@@ -24,3 +25,32 @@ def show(saved: "Saved", strict: bool) -> None:
     if strict and code == 0 and saved.summary.verdict is Verdict.CHECK:
         code = 1
     raise typer.Exit(code)
+
+
+class Told(Protocol):
+    """What a command found that writes no rig file."""
+
+    @property
+    def text(self) -> str: ...
+
+    @property
+    def warnings(self) -> tuple[str, ...]: ...
+
+    @property
+    def exit_code(self) -> int: ...
+
+    def as_json(self) -> dict[str, object]: ...
+
+
+def tell(found: Told, json_file: Path | None, force: bool) -> None:
+    """Print what was found, write it as JSON where that is asked for, and leave with its exit code."""
+    from calibkit.errors import one_line
+    from calibkit.io.atomic import write_json
+
+    for warning in found.warnings:
+        typer.echo(f"warning: {one_line(warning)}", err=True)
+    typer.echo(found.text)
+    if json_file is not None:
+        write_json(json_file, found.as_json(), force)
+        typer.echo(f"written: {one_line(json_file)}")
+    raise typer.Exit(found.exit_code)

@@ -34,6 +34,7 @@ class Told:
     theta: tuple[float, ...]  # in `unit`
     sigma: tuple[float, ...]
     unit: str
+    alike: tuple[str, ...]  # what it is not told from
 
 
 def in_words(cause: Cause, about: About) -> Told:
@@ -49,7 +50,17 @@ def in_words(cause: Cause, about: About) -> Told:
     if name == "distortion":
         said += f", up to {_worst_px(cause.theta, about, k):.2g} px at the image's edge"
     cure = _DRIFTS[drift] if drift else mend
-    return Told(said, cure.format(camera=about.cameras[k], imu=about.imu), tuple(theta.tolist()), tuple(sigma.tolist()), f"{unit}{per}")
+    mended = cure.format(camera=about.cameras[k], imu=about.imu)
+    alike = tuple(named(key, about) for key in cause.alike)
+    return Told(said, mended, tuple(theta.tolist()), tuple(sigma.tolist()), f"{unit}{per}", alike)
+
+
+def named(key: str, about: About) -> str:
+    """Return what a suspect is called."""
+    base, _, drift = key.partition(" with ")
+    name, c = base.rsplit(" ", 1) if base[-1].isdigit() else (base, "0")
+    called = _NAMES[name].format(camera=about.cameras[int(c)], imu=about.imu)
+    return f"{called} with {drift}" if drift else called
 
 
 def number(value: float, sigma: float) -> str:
@@ -143,6 +154,20 @@ _SAYINGS: dict[str, tuple[str, float, Say, str]] = {
         _plain("{imu}'s accelerometer has its axes askew"),
         "run calibkit imu, or joint --imu-model scale-misalignment",
     ),
+}
+_NAMES = {
+    "dt": "dt_{imu}_{camera}",
+    **{f"R_{axis}": f"{{camera}}'s {word}" for axis, word in _TURNS.items()},
+    **{f"p_{axis}": f"{{camera}} along {{imu}}'s {axis} axis" for axis in "xyz"},
+    "focal": "{camera}'s focal length",
+    "centre": "{camera}'s centre",
+    "distortion": "{camera}'s distortion",
+    "line delay": "{camera}'s line delay",
+    "board scale": "the board's size",
+    "gyroscope scale": "{imu}'s gyroscope's scale",
+    "gyroscope axes": "{imu}'s gyroscope's axes",
+    "accelerometer scale": "{imu}'s accelerometer's scale",
+    "accelerometer axes": "{imu}'s accelerometer's axes",
 }
 _PER = {"time": " a minute", "temperature": " per 10 K"}
 _DRIFTS = {

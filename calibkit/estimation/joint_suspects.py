@@ -110,14 +110,20 @@ def with_trajectory(problem: JointProblem, x: JointState) -> JointState:
     return minimise(replace(problem, held=True), x, max_steps=_TRAJECTORY_STEPS, tolerance=1e-5).x
 
 
-def rms_by_sensor(problem: JointProblem, x: JointState) -> dict[str, float]:
-    """Return the rms of what counts: "camera 0" ... px, "gyro" rad/s, "accel" m/s^2."""
-    left, keep = problem.imu_residuals(x), problem.imu.keep
-    out = {kind: _rms(left[keep[:, k], 3 * k : 3 * k + 3]) for k, kind in enumerate(("gyro", "accel"))}
-    for c, frames in enumerate(problem.cameras):
+def left_by_sensor(problem: JointProblem, x: JointState) -> dict[str, tuple[Array, Array]]:
+    """Return the times (n,) s and residuals (n, d) of what counts: "camera 0" ... px, "gyro" rad/s, "accel" m/s^2."""
+    left, imu = problem.imu_residuals(x), problem.imu
+    out = {}
+    for c, (frames, camera) in enumerate(zip(problem.cameras, x.cameras, strict=True)):
         px, valid = corner_residuals(problem, x, c)
-        out[f"camera {c}"] = _rms(px[(frames.views.weight > 0) & valid])
-    return out
+        frame, corner = np.nonzero((frames.views.weight > 0) & valid)
+        out[f"camera {c}"] = frames.t[frame] + camera.dt, px[frame, corner]
+    return out | {kind: (imu.t[imu.keep[:, k]], left[imu.keep[:, k], 3 * k : 3 * k + 3]) for k, kind in enumerate(("gyro", "accel"))}
+
+
+def rms_by_sensor(problem: JointProblem, x: JointState) -> dict[str, float]:
+    """Return the rms of what counts, by the names of `left_by_sensor`."""
+    return {kind: _rms(rows) for kind, (_, rows) in left_by_sensor(problem, x).items()}
 
 
 def _rms(rows: Array) -> float:

@@ -10,12 +10,13 @@ from threadpoolctl import threadpool_limits
 from calibkit.data.observations import Times
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
-from calibkit.errors import BadInputError
-from calibkit.estimation.diagnosis import Diagnosis, Suspect, diagnose
-from calibkit.estimation.diagnosis_words import About, Told, in_words
+from calibkit.errors import BadInputError, NotConvergedError
+from calibkit.estimation.diagnosis import FAMILY_WISE, Diagnosis, diagnose
+from calibkit.estimation.diagnosis_words import About, Told, in_words, named
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_known import known_calibration
 from calibkit.estimation.joint_problem import Drift
+from calibkit.estimation.joint_state import JointState
 from calibkit.estimation.joint_suspects import Known, evidence, rms_by_sensor, with_trajectory
 from calibkit.geometry.so3 import Array
 from calibkit.io.temperature_file import load_temperature
@@ -34,7 +35,6 @@ class Options(Sensors):
     """Which sensors, how to read them, and what else was measured."""
 
     temperature: Path | None = None
-    knots_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,15 @@ class Diagnosed:
         out += [f"  {each.sensor:24}{each.held:>16.3g}{each.best:>12.3g} {each.unit}" for each in self.rms]
         for cause, told in zip(self.diagnosis.causes, self.told, strict=True):
             out += ["", f"  {told.text} ({100 * cause.share:.0f} % of the excess)", f"    {told.mend}"]
-            out += [f"    this motion does not tell it from: {', '.join(cause.alike)}"] if cause.alike else []
+            out += [f"    this motion does not tell it from: {', '.join(told.alike)}"] if told.alike else []
         out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
         out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
         return "\n".join([*out, "", self.verdict])
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether what the causes leave is more than chance."""
+        return bool(self.diagnosis.unexplained_log_p < np.log(FAMILY_WISE))
 
     @property
     def verdict(self) -> str:
@@ -86,13 +91,15 @@ class Diagnosed:
             worst = max(self.rms, key=lambda rms: rms.held / rms.best)
             hide = f": noise of {worst.held:.2g} {worst.unit} for {worst.sensor} would hide it" if worst.held > _HIDES * worst.best else ""
             return f"FAIL: {self.told[0].text}; it is not noise{hide}"
+        if self.unexplained:
+            return "CHECK: the calibration misses this recording by more than its sigmas, for no single cause: run calibkit joint again"
         return "PASS: the calibration fits this recording within its own uncertainty" + (", but for its noise" if self.noise else "")
 
     def as_json(self) -> dict[str, object]:
         """Return everything, for machines."""
         return {
             "schema": "calibkit-diagnosis-1",
-            "verdict": "FAIL" if self.told else "PASS",
+            "verdict": self.verdict.split(":")[0],
             "causes": [
                 {
                     "key": cause.key,
@@ -103,7 +110,7 @@ class Diagnosed:
                     "unit": told.unit,
                     "share": cause.share,
                     "log10_p": cause.log_p / float(np.log(10)),
-                    "alike": list(cause.alike),
+                    "alike": list(told.alike),
                 }
                 for cause, told in zip(self.diagnosis.causes, self.told, strict=True)
             ],
@@ -119,44 +126,63 @@ class Diagnosed:
         return 1 if self.diagnosis.causes else 0
 
 
+@dataclass(frozen=True)
+class Examined:
+    """A recording's own joint estimate beside the calibration under test."""
+
+    read: CameraImu
+    known: Known
+    joint: Joint
+    held: JointState  # the calibration under test with the trajectory that suits it best
+    diagnosed: Diagnosed
+
+
 def run_diagnosis(
     sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent
 ) -> Diagnosed:
+    """Test a rig file's cameras and IMU against a recording before a board, as `examine` does."""
+    return examine(sources, target, rig, options, progress).diagnosed
+
+
+def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent) -> Examined:
     """Test a rig file's cameras and IMU against a recording before a board.
 
-    BadInputError names the file, topic or option that is wrong, or what the rig file lacks.
+    BadInputError names the file, topic or option that is wrong, or what the rig file lacks; NotConvergedError: nothing fits the recording.
     """
     options = options or Options()
     temperature = None if options.temperature is None else load_temperature(options.temperature)
     read = read_camera_imu(sources, target, rig, options, progress)
     known = known_calibration(rig, read.names, read.imu_name, read.imu.model)
     cameras = [CameraInput(views, lens) for views, lens in zip(read.views, read.lenses, strict=True)]
-    joint = read.fitted(cameras, read.settings(spacing=options.knots_s), progress)
+    joint = read.fitted(cameras, read.settings(), progress)
     if not joint.fit.converged:
-        raise BadInputError(
+        raise NotConvergedError(
             f"{read.recording.name}: cameras and IMU do not fit together at any calibration: run calibkit joint, which says why"
         )
     drifts = [Drift("time", *_ramp(joint)), *_of_temperature(joint, options.temperature, temperature)]
+    problem, x = joint.fit.problem, joint.fit.x
     with threadpool_limits(1, user_api="blas"):
         found, suspects = evidence(joint.fit, known, drifts)
         diagnosis = diagnose(found, suspects)
-        rms = _rms(joint, known, read)
+        held = with_trajectory(problem, replace(x, cameras=known.cameras, imu=known.imu))
+    rms = _rms(rms_by_sensor(problem, held), rms_by_sensor(problem, x), read)
     about = About(
         read.names,
         read.imu_name,
         tuple(CAMERAS[lens.model] for lens in read.lenses),
-        tuple(camera.lens for camera in joint.fit.x.cameras),
+        tuple(camera.lens for camera in x.cameras),
         tuple(views.image_size for views in read.views),
     )
-    return Diagnosed(
+    diagnosed = Diagnosed(
         _what(joint, read),
         diagnosis,
         tuple(in_words(cause, about) for cause in diagnosis.causes),
         _noise(rms, joint, read),
-        _untested(diagnosis, suspects),
+        tuple(named(each.key, about) for each in suspects if diagnosis.sigmas[each.key] > WEAK),
         rms,
         tuple(read.warnings),
     )
+    return Examined(read, known, joint, held, diagnosed)
 
 
 def _ramp(joint: Joint) -> tuple[Array, Array]:
@@ -182,13 +208,14 @@ def _of_temperature(joint: Joint, path: Path | None, read: tuple[Times, Array] |
     return [Drift("temperature", t, np.asarray((celsius - inside[0]) / _TEN_K, np.float64))]
 
 
-def _rms(joint: Joint, known: Known, read: CameraImu) -> tuple[Rms, ...]:
-    problem, x = joint.fit.problem, joint.fit.x
-    held = rms_by_sensor(problem, with_trajectory(problem, replace(x, cameras=known.cameras, imu=known.imu)))
-    best = rms_by_sensor(problem, x)
+def _rms(held: dict[str, float], best: dict[str, float], read: CameraImu) -> tuple[Rms, ...]:
+    return tuple(Rms(*sensor, held[kind], best[kind]) for kind, sensor in sensors_of(read).items())
+
+
+def sensors_of(read: CameraImu) -> dict[str, tuple[str, str]]:
+    """Return what each kind of residual is called, and its unit."""
     names = {f"camera {c}": (f"{name}'s corners", "px") for c, name in enumerate(read.names)}
-    names |= {"gyro": (f"{read.imu_name}'s gyroscope", "rad/s"), "accel": (f"{read.imu_name}'s accelerometer", "m/s^2")}
-    return tuple(Rms(*names[kind], held[kind], best[kind]) for kind in names)
+    return names | {"gyro": (f"{read.imu_name}'s gyroscope", "rad/s"), "accel": (f"{read.imu_name}'s accelerometer", "m/s^2")}
 
 
 def _what(joint: Joint, read: CameraImu) -> str:
@@ -215,7 +242,3 @@ def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ..
             text = f"{read.imu_name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
             found.append(Noise(f"{text}: {real:.2e} {density.unit}. Vibration?", factor))
     return tuple(found)
-
-
-def _untested(diagnosis: Diagnosis, suspects: Sequence[Suspect]) -> tuple[str, ...]:
-    return tuple(each.key for each in suspects if diagnosis.sigmas[each.key] > WEAK)

@@ -3,7 +3,7 @@
 import numpy as np
 from rigs import IMU_MODEL, LENSES, SIZES, T_CAM0_IMU0, imu_intrinsics
 
-from calibkit.data.rig import Camera, Estimate, Imu, Rig
+from calibkit.data.rig import Camera, Estimate, Imu, Rig, Transform
 from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
 from calibkit.data.verdict import Status
 from calibkit.geometry import se3, so3
@@ -24,8 +24,18 @@ _IMU = Imu(
     **{name: Estimate(value=value, sigma=0.04 * value, status=Status.DETERMINED) for name, value in _DENSITIES.items()},
     intrinsics=imu_intrinsics(IMU_MODEL),
 )
+_TRANSFORMS = {
+    "T_cam0_imu0": make_transform("cam0", "imu0", T_CAM0_IMU0, COV_T, Status.DETERMINED),
+    "T_imu1_imu0": make_transform("imu1", "imu0", T_HALF_TURN, COV_T, Status.DETERMINED),
+}
 _SIGMA_INTRINSIC = 1e-4  # as imu_intrinsics says
 ENTRIES = 6
+
+
+def _moved(entry: Transform, T: np.ndarray) -> Transform:
+    inverse, q = se3.inverse(T).tolist(), so3.to_quat(T[:3, :3]).tolist()
+    here = {"matrix": T.tolist(), "inverse_matrix": inverse, "rotation_xyzw": q, "translation": T[:3, 3].tolist()}
+    return entry.model_copy(update=here)
 
 
 def _shifted(estimate: Estimate, by: float) -> Estimate:
@@ -71,9 +81,6 @@ def rig(rng: np.random.Generator | None = None, sigmas: float = 1.0) -> Rig:
     return Rig(
         cameras={"cam0": camera("pinhole-radtan", lens() + draw(_ROOT_LENS), COV_LENS)},
         imus={"imu0": imu},
-        transforms={
-            "T_cam0_imu0": make_transform("cam0", "imu0", se3.retract(T_CAM0_IMU0, draw(_ROOT_T)), COV_T, Status.DETERMINED),
-            "T_imu1_imu0": make_transform("imu1", "imu0", se3.retract(T_HALF_TURN, draw(_ROOT_T)), COV_T, Status.DETERMINED),
-        },
+        transforms={name: _moved(entry, se3.retract(np.array(entry.matrix), draw(_ROOT_T))) for name, entry in _TRANSFORMS.items()},
         time_offsets={"dt_imu0_cam0": make_time_offset("imu0", "cam0", offset(float(-0.008 + draw(np.array([[SIGMA_DT]]))[0])))},
     )

@@ -96,7 +96,7 @@ def test_a_lens_costs_what_draws_of_it_do(model: str) -> None:
     px, angle = lens_costs(one, COV_LENS)
     uv, rays = one.rays()
     seen, squares, angles = np.isfinite(rays).all(axis=1), [], []
-    for d in whitened(COV_LENS, 40):
+    for d in whitened(COV_LENS, 16):
         other = known_lens("cam0", camera(model, x + d, COV_LENS))
         turned = next(shift for shift in lens_shifts(one, other) if shift.what == "turned along")
         squares.append(turned.rms**2)

@@ -5,10 +5,14 @@ import pytest
 from drawn_rigs import COV_LENS, COV_T, ENTRIES, SIGMA_DT, T_HALF_TURN, camera, lens, offset, rig
 from rigs import T_CAM0_IMU0
 from scipy.stats import binom, chi2, kstest, norm
+from test_intrinsics_honest import CASES, Case
 
 from calibkit.data.rig import TRANSFORM_PARAMETERS, Estimate, Imu, InputFile, Rig, StageRun
 from calibkit.data.transforms import make_time_offset, make_transform
 from calibkit.data.verdict import Status
+from calibkit.estimation.camera_rig_seed import match_instants
+from calibkit.estimation.lens_fit import fit_lenses
+from calibkit.estimation.lens_trust import lens_covariance
 from calibkit.estimation.rig_difference import FALSE_ALARM, Difference, EntryChange, difference
 from calibkit.estimation.rig_values import inverse_transform, named_as, tangent_covariance
 from calibkit.geometry import se3, so3
@@ -37,6 +41,29 @@ def test_two_calibrations_of_one_rig_differ_by_chance_alone(seeds: int) -> None:
     assert alarms <= binom.ppf(0.999, seeds, FALSE_ALARM)
     assert len(p) == ENTRIES
     assert min(kstest(each, "uniform").pvalue for each in p.values()) > 1e-3  # neither too many nor too few
+
+
+def calibrated(case: Case, seed: int) -> Rig:
+    """Return what intrinsics finds from simulated corners."""
+    views = case.views(seed)
+    fit = fit_lenses(views, [one.model.name for one in case.cameras], match_instants(views))
+    cov, at, cameras = lens_covariance(fit).corrected, 0, {}
+    for c, (one, x) in enumerate(zip(case.cameras, fit.state.lenses, strict=True)):
+        here = slice(at, at + len(x))
+        cameras[f"cam{c}"], at = camera(one.model.name, x, cov[here, here]), here.stop
+    if len(cameras) == 1:
+        return Rig(cameras=cameras)
+    T = make_transform("cam1", "cam0", fit.state.T_cam_cam0[1], cov[at:, at:], Status.DETERMINED)
+    return Rig(cameras=cameras, transforms={"T_cam1_cam0": T})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "pairs"), [("pinhole-radtan", 100), ("pinhole-radtan and pinhole-equi", 60)])
+def test_two_simulated_calibrations_of_one_rig_differ_by_chance_alone(name: str, pairs: int) -> None:
+    """The sigmas are the estimator's own here, not the true ones."""
+    alarms = sum(difference(*(calibrated(CASES[name], 2 * pair + k) for k in range(2))).changed for pair in range(pairs))
+    print(f"{name}: {alarms} alarms in {pairs} pairs")
+    assert alarms <= binom.ppf(0.999, pairs, FALSE_ALARM)
 
 
 def test_sigmas_that_are_too_small_alarm() -> None:

@@ -135,6 +135,8 @@ def _implied(new: Lens, rays: Array, uv: Array, ranges: Sequence[float]) -> Arra
             blocks.append(np.where(seen.valid[:, None, None], J, 0.0)[..., free])
         return np.concatenate(blocks).reshape(-1, blocks[0].shape[-1])
 
+    if 2 * len(rays) < 6:  # an image that sees next to nothing
+        return np.eye(4)
     return motion(least_squares(residual, np.zeros(6)[free], jac=jacobian, x_scale="jac", method="lm").x)
 
 

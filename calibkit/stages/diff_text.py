@@ -56,7 +56,8 @@ def _shift(name: str, shift: Shift) -> tuple[str, ...]:
     worst, at = shift.worst
     if not isfinite(worst):
         return name, shift.what, range_text(shift.range_m), "no pixel in common", "", ""
-    return name, shift.what, range_text(shift.range_m), sized(worst, "px"), region_of(at, shift.size), sized(shift.rms, "px")
+    lost = f" ({shift.lost:.0%} of the image is seen by one alone)" if shift.lost else ""
+    return name, shift.what, range_text(shift.range_m), sized(worst, "px"), region_of(at, shift.size), sized(shift.rms, "px") + lost
 
 
 def _verdict(found: Difference, shifts: Mapping[str, list[Shift]]) -> Iterator[str]:

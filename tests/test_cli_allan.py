@@ -68,7 +68,7 @@ def test_rest_in_noise_out(run: Run, recording: Path, tmp_path: Path) -> None:
     assert "gyro_x walk (K) is not observable in this recording" in said.out
     assert " h needed to tell " in said.out
     assert "deg/sqrt(h)" in said.out
-    assert {path.name for path in report.iterdir()} >= {"report.html", "report.json", "imu0-allan-allan.png"}
+    assert {path.name for path in report.rglob("*.*")} >= {"report.html", "report.json", "imu0-allan-allan.png"}
     data = json.loads((tmp_path / "all.json").read_text())
     assert data["facts"]["allan"]["axes"]["gyro_x"]["walk"]["upper95"] > 0
     with (tmp_path / "curve.csv").open() as stream:

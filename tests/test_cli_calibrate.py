@@ -145,7 +145,7 @@ def test_the_sample_bag_says_what_the_readme_says(run: Run, tmp_path: Path, monk
     assert np.all(off[:3] < 2e-3)
     assert np.all(off[3:] < 3e-4)
     assert abs((rig.time_offsets["dt_imu0_cam0"].offset.value or 0) - 0.005) < 6e-5
-    assert len(list((tmp_path / "out" / "report").glob("*.png"))) > 15
+    assert len(list((tmp_path / "out" / "report" / "pictures").glob("*.png"))) > 15
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -122,7 +122,7 @@ def test_pairs_to_a_rig_file_with_its_residuals_report_and_json(run: Run, tmp_pa
     assert found["poses_kept"] == N
     assert len(found["residuals"]["angle"]) == N
     assert found["scatter"]["distance"] < 2e-3
-    made = {path.name for path in report.iterdir()}
+    made = {path.name for path in report.rglob("*.*")}
     assert {f"T_gripper_cam-handeye-{key}.png" for key in ("pose_residuals", "rotation_axes", "cross_sections", "poses_in_space")} <= made
     assert "daniilidis" in (report / "report.html").read_text()
 

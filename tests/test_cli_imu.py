@@ -70,7 +70,7 @@ def test_stands_in_scale_and_axes_out(run: Run, recording: Path, made: MultiPosi
     assert_near(found.parameters, made.model.values(), found.parameters)
     assert found.verdict is Verdict.PASS
     assert found.correction in said.out
-    assert {path.name for path in (tmp_path / "report").iterdir()} == {"imu0-imu-stands.png", "report.html", "report.json"}
+    assert {path.name for path in (tmp_path / "report").iterdir()} == {"pictures", "report.html", "report.json", "report.md"}
     values = {name: estimate.value for name, estimate in found.parameters.items() if estimate.value is not None}
     force, omega = np.array([[0.3, -9.0, 4.0]]), np.array([[0.5, -0.2, 0.9]])
     a, w = ImuModel.of(values).correct(*made.model.measure(force, omega))

@@ -70,7 +70,7 @@ def rich(tmp_path_factory: pytest.TempPathFactory) -> Files:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the report's pictures out: one run here lays them out, and the report has tests of its own."""
-    monkeypatch.setattr(page, "draw", lambda view: [])
+    monkeypatch.setattr(page, "draw", lambda view, formats: [])
 
 
 @pytest.fixture(scope="module")
@@ -150,9 +150,10 @@ def test_a_camera_before_a_board(run: Run, rich: Files, tmp_path: Path, monkeypa
     assert facts["td"] == offset(out).value
     # 5 ms at 1 rad/s and 500 px are 2.5 px (the SPEC's worked example 3)
     assert facts["px_at_max_rate"] == pytest.approx(461.2 * facts["rate_max"] * facts["td"])
-    assert {path.name for path in report.iterdir()} == {
+    assert {path.name for path in report.rglob("*.*")} == {
         "report.html",
         "report.json",
+        "report.md",
         *(f"dt_imu0_cam0-timeoffset-{name}.png" for name in ("v_curve", "rates", "residual_rate", "offset_over_time")),
     }
     turns, v, _ = saved(tmp_path / "rig.yaml")

@@ -181,7 +181,7 @@ def test_a_dead_sensor_is_told_and_drawn_without(run: Run, tmp_path: Path) -> No
     said = run("allan", write(tmp_path / "imu.csv", samples), "--report", report)
     assert said.code == 3, said
     assert "gyro_x white, gyro_x flicker and gyro_x walk are not observable: every sample has the same value" in said.out
-    assert (report / "imu0-allan-allan.png").exists()
+    assert (report / "pictures" / "imu0-allan-allan.png").exists()
 
 
 def test_a_density_of_fewer_than_three_axes_names_them(run: Run, tmp_path: Path) -> None:

@@ -85,12 +85,58 @@ def test_the_imus_known_intrinsics_are_used(run: Run, session: Session, files: P
     assert errors[0] < errors[1] / 3
 
 
+def test_two_imus_are_two_runs_on_one_rig_file(run: Run, session: Session, files: Path, tmp_path: Path) -> None:
+    """imu1 is imu0 turned by a quarter, with stamps 10 ms late: T_imu0_imu1 is that turn, dt_imu1_imu0 the 10 ms."""
+    assert session.imu is not None
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # R_imu0_imu1
+    imu = session.imu
+    write_imu(files / "imu_b.csv", replace(imu, t_ns=imu.t_ns + 10_000_000, gyro=imu.gyro @ turn, accel=imu.accel @ turn))
+    out = tmp_path / "out.yaml"
+    both = run(*ask(files, "--imu", "imu_b")).mistake
+    assert "--imu imu and --imu imu_b: one IMU a run" in both
+    assert run(*ask(files, "--no-halves", "-o", out)).code == 0
+    again = ("joint", files / "corners.csv", files / "imu_b.csv", "--target", TARGET, "--rig", out, "-o", out, "--camera", "corners")
+    assert run(*again, "--imu", "imu1=imu_b", "--no-halves").code == 0
+    rig = load_rig(out)
+    T = np.linalg.inv(np.array(rig.transforms["T_cam0_imu0"].matrix)) @ np.array(rig.transforms["T_cam0_imu1"].matrix)
+    assert np.abs(T[:3, :3] - turn).max() < 5e-4
+    assert np.abs(T[:3, 3]).max() < 1e-3
+    later, sooner = (rig.time_offsets[f"dt_{name}_cam0"].offset.value for name in ("imu1", "imu0"))
+    assert later is not None
+    assert sooner is not None
+    assert later - sooner == pytest.approx(0.010, abs=1e-4)
+    assert [entry.stage for entry in rig.provenance].count("joint") == 2
+    assert run("report", out, "-o", tmp_path / "report").code == 0
+    assert "T_cam0_imu1" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_what_was_never_recorded_at_once_is_named(run: Run, session: Session, files: Path) -> None:
+    """Corners of the first 5 s, the IMU of the last 5 s."""
+    assert session.imu is not None
+    t = (session.imu.t_ns - session.imu.t_ns[0]) * 1e-9
+    write_imu(files / "last.csv", session.imu.select(t > 7))
+    (files / "first").mkdir()
+    head, *rows = (files / "corners.csv").read_text().splitlines()
+    start = int(rows[0].split(",")[0])
+    (files / "first" / "corners.csv").write_text(
+        "\n".join([head, *(row for row in rows if int(row.split(",")[0]) - start < 5_000_000_000)])
+    )
+    asked = ("joint", files / "first" / "corners.csv", files / "last.csv", "--target", TARGET, "--rig", files / "rig.yaml")
+    said = run(*asked, "--camera", "corners", "--imu", "last", "--no-halves")
+    assert said.code in (1, 3)
+    assert re.search(r"FAIL +cam0 and imu0 share no time by their stamps \(cam0 ends 2\.\d* s before imu0 begins\)", said.out)
+
+
 def test_mistakes_are_one_line(run: Run, session: Session, files: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare.yaml"
     save_rig(Rig(), bare)
     assert session.imu is not None
     write_imu(files / "in_g.csv", replace(session.imu, accel=session.imu.accel / 9.80665))
     assert "it is in g; say --accel-unit g" in run(*ask(files, imu="in_g.csv")).mistake
+    write_imu(files / "in_deg.csv", replace(session.imu, gyro=np.degrees(session.imu.gyro)))
+    assert "imu0 turns 57 times as fast as cam0: a gyroscope in deg/s" in run(*ask(files, imu="in_deg.csv")).mistake
+    write_imu(files / "frozen.csv", replace(session.imu, gyro=session.imu.gyro * 0))
+    assert "cam0 and imu0: the gyroscope gives one and the same value throughout" in run(*ask(files, imu="frozen.csv")).mistake
     assert "has no lens: run calibkit intrinsics" in run(*ask(files)[:5], "--rig", bare, "--camera", "corners", "--imu", "imu").mistake
     assert "there is no" in run(*ask(files)[:-4], "--camera", "cam7", "--imu", "imu").mistake
     assert "--knots 1: give 2 to 500 ms" in run(*ask(files, "--knots", 1)).mistake

@@ -19,7 +19,7 @@ def run(
         list[str] | None,
         typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
     ] = None,
-    imu: Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic.")] = None,
+    imu: options.OneOfImus = None,
     out: options.Out = None,
     rig: options.Rigs = None,
     report: options.Report = None,
@@ -67,7 +67,7 @@ def run(
         raise BadInputError(f"--knots {knots:g}: give 2 to 500 ms")
     asked = Options(
         cameras=tuple(camera or ()),
-        imu=imu,
+        imu=options.one_imu(imu),
         reading=ImuOptions(rate, gyro_unit, accel_unit),
         gravity=options.gravity_of(gravity, latitude, altitude),
         knots_s=None if knots is None else knots * 1e-3,

@@ -85,7 +85,7 @@ class Joint:
     densities_told: tuple[bool, bool]  # white noise of gyroscope and accelerometer
     walks_told: tuple[bool, bool]
     frozen: tuple[Frozen, ...] = ()  # of the IMU, left out
-    rival: Rival | None = None  # another solution that fits as well, where motion repeats itself
+    rival: Rival | None = None  # another solution that cannot be ruled out, where motion repeats itself
 
     @property
     def frames_left_out(self) -> int:
@@ -210,7 +210,8 @@ def _posed(each: CameraInput) -> BoardPoses:
     poses = board_poses(each.views, each.camera)
     if len(poses.frame) < _FEWEST_FRAMES:
         of = f"{counted(each.views.n_images, 'image')} of {each.views.camera}"
-        raise BadInputError(f"{len(poses.frame)} of {of} show the board well enough: give {_FEWEST_FRAMES} or more, at 4 Hz or faster")
+        remedy = f"give {_FEWEST_FRAMES} or more, at 4 Hz or faster, and this board's target file"
+        raise BadInputError(f"{len(poses.frame)} of {of} show the board well enough: {remedy}")
     return poses
 
 

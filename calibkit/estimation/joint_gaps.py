@@ -40,6 +40,17 @@ def gaps_of_camera(joint: Joint, c: int, name: str) -> list[Reason]:
     return [Reason(Verdict.CHECK, f"{name} has {told}, images missing or without the board: the IMU alone holds the trajectory there")]
 
 
+def never_together(joint: Joint, c: int, name: str, imu: str) -> str:
+    """Say where by their stamps a camera and the IMU were never recorded at once."""
+    t_ns, track = joint.poses[c].t_ns, joint.seeds[c].track
+    before = (track.origin_ns - int(t_ns.max())) * 1e-9
+    after = (int(t_ns.min()) - track.origin_ns) * 1e-9 - track.duration
+    if max(before, after) <= 0:
+        return ""
+    order = f"{name} ends {before:.3g} s before {imu} begins" if before > 0 else f"{name} begins {after:.3g} s after {imu} ends"
+    return f"{name} and {imu} share no time by their stamps ({order}), and no offset lays one on the other: record both at once"
+
+
 def _told(start: Array, length: Array, noun: str) -> str:
     at = int(np.argmax(length))
     return f"{counted(len(start), noun)} of up to {length[at]:.2g} s, the longest {start[at]:.4g} s in"

@@ -12,17 +12,18 @@ from calibkit.estimation.joint_trust import Trust
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 
-_APART_S = 5e-3  # what lies nearer is one solution
+_APART_S = 0.05  # what lies nearer is one solution
 _WORSE = 0.05  # of the residuals' number, as -2 ln likelihood: by so much a solution is surely the worse one
 _CLEAN = 2.0  # real over stated sigma: what fits worse is no solution that could rule out another
 
 
 @dataclass(frozen=True)
 class Rival:
-    """Another solution that fits as well."""
+    """Another solution that cannot be ruled out."""
 
     offsets: tuple[float, ...]  # s, dt of each camera
     apart: Array  # (p,) the step of the border to it
+    alike: bool  # it fits as well; else neither fits
 
 
 def fit_best(starts: Sequence[tuple[JointProblem, JointState]]) -> tuple[JointFit, int, Rival | None]:
@@ -37,7 +38,7 @@ def fit_best(starts: Sequence[tuple[JointProblem, JointState]]) -> tuple[JointFi
     if not others or (clean and others[0] not in alike):
         return fit, best, None
     other = rough[others[0]]
-    return fit, best, Rival(tuple(camera.dt for camera in other.x.cameras), border_step(fit, other))
+    return fit, best, Rival(tuple(camera.dt for camera in other.x.cameras), border_step(fit, other), others[0] in alike)
 
 
 def _misfit(fit: RoughFit) -> float:

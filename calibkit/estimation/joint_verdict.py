@@ -11,8 +11,9 @@ from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_causes import jittering, wrong_sensors
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_frozen import WORDS
-from calibkit.estimation.joint_gaps import gaps_of_camera, gaps_of_imu
+from calibkit.estimation.joint_gaps import gaps_of_camera, gaps_of_imu, never_together
 from calibkit.estimation.joint_imu import ImuInput
+from calibkit.estimation.joint_rivals import Rival
 from calibkit.estimation.joint_state import A_G, IMU_MODEL, LINE, M_A, M_G, PHI
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
@@ -79,7 +80,7 @@ def judge_joint(
         known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
         reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
         if joint.rival is not None:
-            reasons[dt] = (_of_rival(dt, fit.x.cameras[c].dt, joint.rival.offsets[c]),)
+            reasons[dt] = (_of_rival(dt, fit.x.cameras[c].dt, joint.rival, c),)
         rolls = _of_shutter(joint, checks, name, c)
         judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
         if statuses[k] is not Status.NOT_OBSERVABLE:
@@ -91,7 +92,11 @@ def judge_joint(
         if cause is not None:
             reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
     reasons[imu] = _of_imu(joint, statuses, imu, of_imu)
-    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter))
+    lost = [
+        statuses[border[f"dt {c}"].start] is Status.NOT_OBSERVABLE or fit.factors["gyro"] > _NOISIER["gyro"][1] for c in range(len(names))
+    ]
+    strangers = [never_together(joint, c, name, imu) for c, name in enumerate(names) if lost[c]]
+    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter), [text for text in strangers if text])
     reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, (*names, imu)))}
     return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
 
@@ -110,9 +115,11 @@ def _of_offset(joint: Joint, c: int, dt: str, name: str, imu: str) -> tuple[Reas
     return tuple(found)
 
 
-def _of_rival(dt: str, one: float, other: float) -> Reason:
-    both = f"{other * 1e3:+.1f} ms fits as well as {one * 1e3:+.1f} ms"
-    return Reason(Verdict.FAIL, f"{dt}: not observable: {both}: the motion repeats itself; turn irregularly, about several axes")
+def _of_rival(dt: str, one: float, rival: Rival, c: int) -> Reason:
+    ms = f"{one * 1e3:+.1f}", f"{rival.offsets[c] * 1e3:+.1f} ms"
+    both = f"{ms[1]} fits as well as {ms[0]} ms" if rival.alike else f"neither {ms[0]} nor {ms[1]} fits"
+    why = "the motion repeats itself" if rival.alike else "the motion repeats itself, or the sensors contradict each other"
+    return Reason(Verdict.FAIL, f"{dt}: not observable: {both}: {why}; turn irregularly, about several axes")
 
 
 def _open_text(each: Open) -> str:
@@ -200,14 +207,14 @@ def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, .
     return tuple(found)
 
 
-def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool) -> tuple[Reason, ...]:
+def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool, strangers: list[str]) -> tuple[Reason, ...]:
     fit = joint.fit
     found = []
     if not fit.converged:
         found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
-    wrong = wrong_sensors(joint, imu)
+    wrong = strangers or list(wrong_sensors(joint, imu).values())
     if wrong:
-        found = [Reason(Verdict.FAIL, text) for text in wrong.values()]
+        found = [Reason(Verdict.FAIL, text) for text in wrong]
     else:
         found += [reason for i, kind in enumerate(WORDS) if not jitter for reason in _of_samples(joint, i, kind, imu)]
         found += _of_scale(joint, checks, imu)

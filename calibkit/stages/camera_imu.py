@@ -79,7 +79,9 @@ class CameraImu:
             return calibrate_joint(cameras, self.imu.samples, _noise(self.known_imu), settings, progress)
         except BadInputError as error:
             damaged = "".join(f" ({text})" for text in self.recording.warnings)  # what was not read may be why
-            raise BadInputError(f"{self.recording.name}: {', '.join(self.names)} and {self.imu_name}: {error}{damaged}") from None
+            seen, imu = ", ".join(self.names), self.imu_name
+            text = str(error).replace("the first", seen).replace("the second", imu)  # as the time offset calls them
+            raise BadInputError(f"{self.recording.name}: {seen} and {imu}: {text}{damaged}") from None
 
 
 def read_camera_imu(
@@ -142,7 +144,7 @@ def _refuse_imu(samples: ImuSamples, name: str, topic: str) -> None:
         raise BadInputError(f"{where} is in counts: say --gyro-unit and --accel-unit, or correct it by its intrinsics first")
     size = float(np.median(np.linalg.norm(samples.accel, axis=1))) if len(samples.t_ns) else 0.0
     if _IN_G[0] < size < _IN_G[1]:
-        raise BadInputError(f"{where}: its accelerometer reads {size:.3g} in the middle: it is in g; say --accel-unit g")
+        raise BadInputError(f"{where}: its accelerometer's median is {size:.3g}, not 9.8: it is in g; say --accel-unit g")
 
 
 def _noise(imu: Imu) -> ImuNoise:

@@ -113,7 +113,7 @@ SURVIVED: dict[str, tuple[Callable[[int], Recording], tuple[str, ...]]] = {
 # What it suffers, and how the first reason names it.
 NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
     "10 ms of jitter": (fault("image-jitter"), "cam0: its stamps jitter by"),
-    "accelerometer in g": (fault("accel-in-g"), "imu0's accelerometer reads 0.1"),
+    "accelerometer in g": (fault("accel-in-g"), r"imu0's accelerometer reads 0\.(1|09)"),
     "board a tenth too small": (fault("board-size"), r"the board seems 1\.(09|10)"),
     "tag spacing": (fault("tag-spacing"), "the board seems"),
     "gyroscope's axes swapped": (changed(partial(gyro, M=SWAP)), "imu0's gyroscope has its axes wrong: its x, y, z are the rig's y, x, z"),

@@ -20,7 +20,7 @@ _NOISY = 3.0  # real over stated sigma
 _EXPLAINED = 0.8  # of what a sensor reads must come from the others' motion by one matrix
 _OTHER_UNIT = 0.15  # of a scale's logarithm
 _TURNED = np.radians(10.0)
-_LATELY_S, _WORSE_S, _FACTOR = 5e-4, 5e-3, 2.0  # jitter that is told, that spoils all, and what it must do to the corners
+_LATELY_S, _WORSE_S, _FACTOR = 5e-4, 5e-3, 1.5  # jitter that is told, that spoils all, and what it must do to the corners
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ from calibkit.solver.robust import cauchy
 _CHUNK = 2000  # IMU samples worked on at once: memory stays flat
 # A trajectory that nothing measures stays as it moves: what moves more than this has sensors of its own to say so.
 _TURN_CHANGE, _ACCELERATION = 200.0, 100.0  # rad/s^2, m/s^2
+# The outermost control points hang on a few samples with a hundredth of their weight: a bad frame there must not wind one half round.
+_ENDS, _END_TURN = 2, 0.05  # rad, of neighbouring steps
 EXTRAS_OF_IMU = {name: size for name, size in EXTRAS.items() if name != LINE}
 
 
@@ -315,12 +317,13 @@ class JointProblem:
     def _stays(self, x: JointState, steps: Steps) -> Part:
         """Neighbouring steps of rotation and position are alike to h^2 times a great acceleration: what bridges gaps of all sensors."""
         m, h2 = self.knots.controls, self.knots.spacing**2
-        scale = np.repeat([1 / (h2 * _TURN_CHANGE), 1 / (h2 * _ACCELERATION)], 3)
+        scale = np.tile(np.repeat([1 / (h2 * _TURN_CHANGE), 1 / (h2 * _ACCELERATION)], 3), (m - 2, 1))
+        scale[[*range(_ENDS), *range(-_ENDS, 0)], :3] = max(1 / _END_TURN, scale[0, 0])
         K = np.zeros((m - 2, 6, 19))
         for knot, factor in enumerate((1.0, -2.0, 1.0)):
             K[:, np.arange(6), 6 * knot + np.arange(6)] = factor * scale
-        K[:, :3, -1] = -scale[:3] * np.diff(steps.d, axis=0)
-        K[:, 3:, -1] = -scale[3:] * np.diff(x.p, 2, axis=0)
+        K[:, :3, -1] = -scale[:, :3] * np.diff(steps.d, axis=0)
+        K[:, 3:, -1] = -scale[:, 3:] * np.diff(x.p, 2, axis=0)
         offsets = (KNOT * np.arange(3)[:, None] + np.arange(6)).ravel()
         return _products("stays", self.knots, np.arange(m - 2), offsets, K)
 

@@ -88,13 +88,14 @@ def covariance(
 
 
 def covariance_in_time(
-    S: Array, scores: Array, t_s: Array, variance_factor: float, scales: Array, prior: Array | None = None
+    S: Array, scores: Array, t_s: Array, variance_factor: float, scales: Array, prior: Array | None = None, least: float = 0.0
 ) -> Covariance:
     """Return the covariance for information and scores of epochs at t_s, with blocks as long as the residuals are correlated.
 
     Blocks are 1, 2, 4, ... s long while at least nine remain; the length that shows the most correlation is taken (batch means
     grow with the length until they hold it all). That the corrected variance is below the plain one is believed in proportion to the
-    blocks beyond ten: the sum over few of them falls short by chance, and 3 to 6 images had sigmas up to 1.6 times too small.
+    blocks beyond ten: the sum over few of them falls short by chance, and 3 to 6 images had sigmas up to 1.6 times too small. It is never
+    believed to be below `least` times the plain one.
     """
     choices: list[tuple[float, Array, Array]] = []
     length = 1.0
@@ -110,7 +111,7 @@ def covariance_in_time(
         choices.append((correlated, S_blocks, g_blocks))
         length *= 2
     _, S_blocks, g_blocks = max(choices, key=lambda choice: choice[0])
-    return covariance(S_blocks, g_blocks, variance_factor, scales, prior, least=min(1.0, FEW_BLOCKS / len(S_blocks)))
+    return covariance(S_blocks, g_blocks, variance_factor, scales, prior, least=max(least, min(1.0, FEW_BLOCKS / len(S_blocks))))
 
 
 def directions(covariance: Array, scales: Array) -> list[Direction]:

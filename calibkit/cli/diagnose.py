@@ -17,15 +17,9 @@ def run(
     sources: options.BoardAndImu,
     target: options.Target,
     rig: Annotated[list[Path], typer.Option("--rig", metavar="RIG.yaml", help="The calibration to test; repeatable, merged.")],
-    camera: Annotated[
-        list[str] | None,
-        typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
-    ] = None,
+    camera: options.CamerasOfRig = None,
     imu: options.Imu = None,
-    temperature: Annotated[
-        Path | None,
-        typer.Option("--temperature", metavar="FILE", help="CSV with t, temperature [C], on the IMU's clock: what goes with it is named."),
-    ] = None,
+    temperature: options.Temperature = None,
     json_file: options.Json = None,
     gravity: options.LocalGravity = None,
     latitude: options.Latitude = None,
@@ -45,17 +39,11 @@ def run(
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import tell
-    from calibkit.io.imu_options import ImuOptions
     from calibkit.stages.diagnose import Options, run_diagnosis
 
     known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force)
-    asked = Options(
-        cameras=tuple(camera or ()),
-        imu=imu,
-        reading=ImuOptions(rate, gyro_unit, accel_unit),
-        gravity=options.gravity_of(gravity, latitude, altitude),
-        cache=not no_cache,
-        ros_distro=ros_distro,
-        temperature=temperature,
+    read = options.sensors(
+        camera, imu, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
+    asked = Options(**read, temperature=temperature)
     tell(run_diagnosis(sources, target, known, asked, bar), json_file, force)

@@ -15,10 +15,7 @@ def register(app: typer.Typer) -> None:
 def run(
     sources: options.BoardAndImu,
     target: options.Target,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
-    ] = None,
+    camera: options.CamerasOfRig = None,
     imu: options.OneOfImus = None,
     out: options.Out = None,
     rig: options.Rigs = None,
@@ -60,23 +57,20 @@ def run(
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show
     from calibkit.errors import BadInputError
-    from calibkit.io.imu_options import ImuOptions
     from calibkit.stages.joint import Options, joint
 
     if knots is not None and not 2 <= knots <= 500:
         raise BadInputError(f"--knots {knots:g}: give 2 to 500 ms")
+    read = options.sensors(
+        camera, options.one_imu(imu), (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
+    )
     asked = Options(
-        cameras=tuple(camera or ()),
-        imu=options.one_imu(imu),
-        reading=ImuOptions(rate, gyro_unit, accel_unit),
-        gravity=options.gravity_of(gravity, latitude, altitude),
+        **read,
         knots_s=None if knots is None else knots * 1e-3,
         hold_lens=hold_lens,
         imu_model=imu_model,
         g_sensitivity=g_sensitivity,
         line_delay=line_delay,
         halves=not no_halves,
-        cache=not no_cache,
-        ros_distro=ros_distro,
     )
     show(joint(sources, target, options.outputs_of([*sources, target], out, report, json_file, rig, force), asked, bar), strict)

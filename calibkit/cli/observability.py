@@ -17,10 +17,7 @@ def run(
     sources: options.BoardAndImu,
     target: options.Target,
     rig: Annotated[list[Path], typer.Option("--rig", metavar="RIG.yaml", help="Rig files with the lenses; repeatable, merged.")],
-    camera: Annotated[
-        list[str] | None,
-        typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
-    ] = None,
+    camera: options.CamerasOfRig = None,
     imu: options.Imu = None,
     json_file: options.Json = None,
     gravity: options.LocalGravity = None,
@@ -40,17 +37,12 @@ def run(
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import tell
-    from calibkit.io.imu_options import ImuOptions
     from calibkit.stages.camera_imu import Sensors
     from calibkit.stages.observability import observability
 
     known = options.tested([*sources, target], rig, json_file, force)
-    asked = Sensors(
-        cameras=tuple(camera or ()),
-        imu=imu,
-        reading=ImuOptions(rate, gyro_unit, accel_unit),
-        gravity=options.gravity_of(gravity, latitude, altitude),
-        cache=not no_cache,
-        ros_distro=ros_distro,
+    read = options.sensors(
+        camera, imu, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
+    asked = Sensors(**read)
     tell(observability(sources, target, known, asked, bar), json_file, force)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,6 +22,14 @@ Target = Annotated[Path, typer.Option("--target", metavar="T.yaml", help="The bo
 Cameras = Annotated[
     list[str] | None,
     typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: the only one]"),
+]
+CamerasOfRig = Annotated[
+    list[str] | None,
+    typer.Option("--camera", metavar="TOPIC", help="Camera topic, or cam0=/topic; repeatable. [default: as the rig file]"),
+]
+Temperature = Annotated[
+    Path | None,
+    typer.Option("--temperature", metavar="FILE", help="CSV with t, temperature [C], on the IMU's clock: what goes with it is named."),
 ]
 Imu = Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")]
 OneOfImus = Annotated[
@@ -66,6 +74,27 @@ def outputs_of(
     refuse_clashes(inputs, [out, report, json_file, *others])
     refuse_clashes(rigs or (), [report, json_file, *others])  # OUT may be a rig: it is then updated
     return Outputs(out, report, json_file, tuple(rigs or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
+
+
+def sensors(
+    camera: list[str] | None,
+    imu: str | None,
+    reading: tuple[float | None, str | None, str | None],
+    gravity: "Gravity",
+    no_cache: bool,
+    ros_distro: str | None,
+) -> dict[str, Any]:
+    """Return what the stages on cameras and an IMU have in common; `reading` is --rate, --gyro-unit and --accel-unit."""
+    from calibkit.io.imu_options import ImuOptions
+
+    return {
+        "cameras": tuple(camera or ()),
+        "imu": imu,
+        "reading": ImuOptions(*reading),
+        "gravity": gravity,
+        "cache": not no_cache,
+        "ros_distro": ros_distro,
+    }
 
 
 def tested(

@@ -75,6 +75,7 @@ def nothing(recording: Recording, joint: Joint, result: Result) -> None:
     """At rest and gliding: nothing at all."""
     assert unknown(result) == {*P, *R, "offset"}
     assert len(opened(result)) == 6
+    assert "repeats itself" not in str(result.reasons)
     assert result.rig.time_offsets[DT].offset.value is None
 
 

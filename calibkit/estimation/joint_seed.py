@@ -14,7 +14,7 @@ from calibkit.estimation.joint_state import CameraState, JointState
 from calibkit.estimation.orientation_track import OrientationTrack
 from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.estimation.time_offset_start import find_starts
-from calibkit.estimation.time_offset_verdict import judge_time_offset
+from calibkit.estimation.time_offset_verdict import ALIKE, judge_time_offset
 from calibkit.estimation.turns import Turns
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -99,7 +99,8 @@ def _rivals(poses: BoardPoses, turned: Turns, fit: TimeOffsetFit, imu: ImuSample
 
 def _doubtful(poses: BoardPoses, fit: TimeOffsetFit, imu: ImuSamples) -> bool:
     """Whether turns fit at another offset, or lay streams that by their stamps lie side by side mostly apart."""
-    return fit.second is not None or (_overlap(poses, imu) and not _overlap(poses, imu, fit.td))
+    apart = _overlap(poses, imu) and not _overlap(poses, imu, fit.td)
+    return fit.gain >= ALIKE and (fit.second is not None or apart)
 
 
 def _overlap(poses: BoardPoses, imu: ImuSamples, td: float = 0.0) -> bool:

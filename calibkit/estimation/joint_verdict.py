@@ -92,13 +92,26 @@ def judge_joint(
         if cause is not None:
             reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
     reasons[imu] = _of_imu(joint, statuses, imu, of_imu)
-    lost = [
-        statuses[border[f"dt {c}"].start] is Status.NOT_OBSERVABLE or fit.factors["gyro"] > _NOISIER["gyro"][1] for c in range(len(names))
-    ]
-    strangers = [never_together(joint, c, name, imu) for c, name in enumerate(names) if lost[c]]
-    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter), [text for text in strangers if text])
+    wrong = _contradicting(joint, statuses, names, imu)
+    if wrong:  # what they leave open is no lack of motion
+        reasons |= {key: _follows(key, each) for key, each in reasons.items() if key not in (*names, imu)}
+    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter), wrong)
     reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, (*names, imu)))}
     return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
+
+
+def _contradicting(joint: Joint, statuses: Sequence[Status], names: tuple[str, ...], imu: str) -> list[str]:
+    """Name sensors that cannot be brought together, and why."""
+    border, strange = joint.fit.problem.border, joint.fit.factors["gyro"] > _NOISIER["gyro"][1]
+    lost = [c for c in range(len(names)) if strange or statuses[border[f"dt {c}"].start] is Status.NOT_OBSERVABLE]
+    apart = [text for c in lost if (text := never_together(joint, c, names[c], imu))]
+    return apart or list(wrong_sensors(joint, imu).values())
+
+
+def _follows(key: str, reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
+    """Return one reason for all that failed of an entry, where its sensors are at fault."""
+    failed = [reason for reason in reasons if reason.verdict is Verdict.FAIL]
+    return (Reason(Verdict.FAIL, f"{key}: not observable: its sensors contradict each other"),) if failed else reasons
 
 
 def _rank(key: str, names: tuple[str, ...]) -> int:
@@ -207,12 +220,11 @@ def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, .
     return tuple(found)
 
 
-def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool, strangers: list[str]) -> tuple[Reason, ...]:
+def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool, wrong: list[str]) -> tuple[Reason, ...]:
     fit = joint.fit
     found = []
     if not fit.converged:
         found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
-    wrong = strangers or list(wrong_sensors(joint, imu).values())
     if wrong:
         found = [Reason(Verdict.FAIL, text) for text in wrong]
     else:

@@ -13,7 +13,7 @@ from calibkit.estimation.time_offset import TimeOffsetFit
 from calibkit.estimation.time_offset_doubts import INVERSE, axes_apart, contrary, scale, unlike
 from calibkit.solver.trust import SCALES, grade
 
-_ALIKE = 60.0  # chi-squared that turns in common must explain; noise alone, searched over every lag and rotation, reaches 40
+ALIKE = 60.0  # chi-squared that turns in common must explain; noise alone, searched over every lag and rotation, reaches 40
 _PRETENDED = 0.2  # of the information may be noise in the rates
 _BOWL = 25.0  # chi-squared of the V's bottom below its sides
 _STILL = 0.02  # rad/s; slower is standing still
@@ -107,15 +107,15 @@ def _not_observable(of: str, to: str, fit: TimeOffsetFit) -> str:
     known = track.rate[track.chain >= 0]
     middle, fast = rates(fit)
     change = _change(fit)
-    if fit.gain >= _ALIKE and fit.depth >= _BOWL and fit.noise_share > _PRETENDED:
+    if fit.gain >= ALIKE and fit.depth >= _BOWL and fit.noise_share > _PRETENDED:
         return (
             f"{100 * fit.noise_share:.0f} % of what seems to tell it is the noise of {to}'s rates: turn faster, or give less noisy ones "
             f"(--of {to} --to {of} if {of} is less noisy)"
         )
-    if fit.gain < _ALIKE or fit.depth < _BOWL:
+    if fit.gain < ALIKE or fit.depth < _BOWL:
         if fast < _STILL or float(np.median(np.linalg.norm(known, axis=1))) < _STILL:
             return f"the rig hardly turns ({middle:.2g} rad/s in the middle): at rest every offset fits alike; {_MOTION}"
-        if change > 0.3 and (fit.gain < _ALIKE or unlike(fit) > _UNLIKE):
+        if change > 0.3 and (fit.gain < ALIKE or unlike(fit) > _UNLIKE):
             return (
                 f"{of} and {to} never turn alike at any offset: are both on one rigid body, do they overlap in time, is a topic wrong, "
                 f"or are {INVERSE}?"

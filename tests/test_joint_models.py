@@ -97,6 +97,7 @@ def within(z: Array) -> None:
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.2
 
 
+@pytest.mark.slow
 def test_what_does_not_turn_tells_no_scale_of_the_gyroscope() -> None:
     recording = recorded(0, SHORT_S, motion="translation")
     _, result = calibrated(recording, imu_input("imu0", through(IDEAL_G, recording.imu), None, SCALED))
@@ -159,6 +160,7 @@ def test_given_intrinsics_without_a_covariance_are_held_and_it_is_said() -> None
     assert not freed.given
 
 
+@pytest.mark.slow
 def test_another_unit_is_no_scale() -> None:
     recording = recorded(0, SHORT_S)
     imu = imu_input("imu0", replace(recording.imu, accel=recording.imu.accel * 1.5), None, SCALED)
@@ -214,6 +216,7 @@ def test_line_delays_are_found_and_their_sigmas_honest() -> None:
     within(np.array([check_line_delay(seed) for seed in range(20)]))
 
 
+@pytest.mark.slow
 def test_line_delay_is_not_claimed_at_rest() -> None:
     recording = recorded(0, SHORT_S, motion="static")
     _, result = calibrated(recording, ImuInput(recording.imu), (LINE,))
@@ -232,6 +235,7 @@ def test_rolling_shutter_that_nobody_asked_for_is_told() -> None:
     assert text.endswith("a rolling shutter? Add --line-delay")
 
 
+@pytest.mark.slow
 def test_line_delay_of_the_rig_file_is_used() -> None:
     recording = turned_through(recorded(0, SHORT_S), LINE_DELAY)
     camera = recording.camera

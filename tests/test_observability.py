@@ -38,13 +38,12 @@ def check_advice(motion: str, seed: int) -> None:
     assert worst(found[-1].cov, trust.scales, joint.fit) < DETERMINED
 
 
-@pytest.mark.parametrize("motion", ["single-axis", "rich"])
-def test_the_motion_to_add_is_named(motion: str) -> None:
-    check_advice(motion, 0)
+def test_no_motion_is_asked_for_where_all_is_determined() -> None:
+    check_advice("rich", 0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("motion", LACKS)
 def test_the_motion_to_add_is_named_over_seeds(motion: str, seed: int) -> None:
     check_advice(motion, seed)

@@ -97,7 +97,7 @@ SURVIVED: dict[str, tuple[Callable[[int], Recording], tuple[str, ...]]] = {
     "0.8 s without images": (changed(partial(without_images, start=20, end=20.8)), ()),
     "one frame in fifty lost": (changed(one_in_fifty_lost), ()),
     "half a second without IMU": (fault("imu-gap"), ()),
-    "a second without both": (changed(gap_of_both), ("gap of up to 1 s",)),
+    "a second without both": (changed(gap_of_both), ("imu0 has 1 gap of up to 1 s", "cam0 has 1 gap of up to 1.1 s")),
     "a large bias": (changed(partial(gyro, M=EYE, bias=(0.5, -0.4, 0.3))), ()),
     "4 Hz": (changed(partial(only_frames, keep=slice(None, None, 5))), ()),
     "lost frames": (fault("image-drops-30"), ("of the frames are missing",)),

@@ -85,6 +85,7 @@ def test_the_imus_known_intrinsics_are_used(run: Run, session: Session, files: P
     assert errors[0] < errors[1] / 3
 
 
+@pytest.mark.slow
 def test_two_imus_are_two_runs_on_one_rig_file(run: Run, session: Session, files: Path, tmp_path: Path) -> None:
     """imu1 is imu0 turned by a quarter, with stamps 10 ms late: T_imu0_imu1 is that turn, dt_imu1_imu0 the 10 ms."""
     assert session.imu is not None

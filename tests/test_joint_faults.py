@@ -128,6 +128,10 @@ NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
     ),
 }
 ALIKE = {
+    "10 ms of jitter",
+    "one acceleration of 400",
+    "one stamp 50 ms off",
+    "half a second without IMU",
     "a large bias",
     "a second without both",
     "accelerometer's axis flipped",
@@ -211,6 +215,7 @@ def lens_of_fronto_parallel_views(seed: int, sigmas: float = 3.0) -> None:
     assert all("is weak" in reason.text for reason in recording.result(joint).reasons)
 
 
+@pytest.mark.slow
 def test_nearly_fronto_parallel_views_tell_the_lens_by_the_imu() -> None:
     lens_of_fronto_parallel_views(0)
 

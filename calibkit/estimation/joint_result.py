@@ -1,6 +1,7 @@
 """From a joint estimate to a result: the rig's entries, what is said of them, and what the report draws."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from calibkit.estimation.time_offset_result import early_or_late
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Steps, basis
+from calibkit.solver.trust import grade
 
 STAGE = "joint"
 _BIAS_DRAWS = 32  # of the state: a sigma is then known to 13 %
@@ -40,6 +42,8 @@ def joint_result(
     before: Imu | None = None,
 ) -> Result:
     """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera; `before` is the rig file's entry of the IMU."""
+    if not _tells_an_offset(joint, trust):  # the motion leaves it open: another solution is no news
+        joint = replace(joint, rival=None)
     trust = spread(trust, joint.rival)
     names = tuple(each.views.camera for each in cameras)
     judged = judge_joint(joint, trust, checks, cameras, imu, of_imu, stamps)
@@ -96,6 +100,11 @@ def joint_result(
         },
         not_observable=tuple(unknown),
     )
+
+
+def _tells_an_offset(joint: Joint, trust: Trust) -> bool:
+    at = [joint.fit.problem.border[f"dt {c}"].start for c in range(len(joint.fit.problem.cameras))]
+    return any(grade(float(np.sqrt(trust.cov[k, k]) / trust.scales[k])) != "not observable" for k in at)
 
 
 def _estimate(value: float, unit: str, trust: Trust, k: int, status: Status) -> Estimate:

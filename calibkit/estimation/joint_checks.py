@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibkit.estimation.joint_fit import JointFit, corner_residuals
+from calibkit.estimation.joint_fit import JointFit
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
 from calibkit.estimation.joint_problem import JointProblem
 from calibkit.estimation.joint_rivals import border_step
 from calibkit.estimation.joint_state import LINE, LINE_SCALE, SCALE, JointState
+from calibkit.estimation.joint_suspects import rms_by_sensor
 from calibkit.estimation.joint_trust import border_scales, joint_covariance
 from calibkit.estimation.lens_fit import rows_of
 from calibkit.geometry.so3 import Array
@@ -81,18 +82,12 @@ def _halves(fit: JointFit) -> Halves | None:
     held = replace(second.problem, held=True)
     other = minimise(held, _with_calibration(second.x, first.x), max_steps=_HALF_STEPS, tolerance=1e-5).x
     count = range(len(fit.problem.cameras))
-    rms, own = (tuple(_rms(second.problem, x, c) for c in count) for x in (other, second.x))
+    rms, own = (tuple(rms_by_sensor(second.problem, x)[f"camera {c}"] for c in count) for x in (other, second.x))
     return Halves(z, rms, own)
 
 
 def _with_calibration(x: JointState, of: JointState) -> JointState:
     return replace(x, cameras=of.cameras, gravity=of.gravity, board_scale=of.board_scale, imu=of.imu)
-
-
-def _rms(problem: JointProblem, x: JointState, c: int) -> float:
-    px, valid = corner_residuals(problem, x, c)
-    kept = (problem.cameras[c].views.weight > 0) & valid
-    return float(np.sqrt(np.sum(px[kept] ** 2) / max(int(kept.sum()), 1)))
 
 
 def _refit(problem: JointProblem, x: JointState) -> JointFit:

@@ -27,6 +27,7 @@ from calibkit.stages.camera_imu import CameraImu, Sensors, read_camera_imu
 _A_MINUTE_S, _TEN_K = 60.0, 10.0
 _NOISIER = 1.4  # than it was: twice the variance
 _HIDES = 1.2  # times the noise: who sees it may raise R
+_LEFT = 0.2  # of the excess, beside the causes
 _LEAST_K = 1.0  # of temperature, that something may go with it
 
 
@@ -75,6 +76,9 @@ class Diagnosed:
         for cause, told in zip(self.diagnosis.causes, self.told, strict=True):
             out += ["", f"  {told.text} ({100 * cause.share:.0f} % of the excess)", f"    {told.mend}"]
             out += [f"    this motion does not tell it from: {', '.join(told.alike)}"] if told.alike else []
+        left = 1 - sum(cause.share for cause in self.diagnosis.causes)
+        if self.told and left > _LEFT:
+            out += ["", f"  {100 * left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit joint again"]
         out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
         out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
         return "\n".join([*out, "", self.verdict])
@@ -114,6 +118,7 @@ class Diagnosed:
                 }
                 for cause, told in zip(self.diagnosis.causes, self.told, strict=True)
             ],
+            "unexplained": self.unexplained,
             "noise": [{"text": each.text, "factor": each.factor} for each in self.noise],
             "not_tested": list(self.untested),
             "rms": [{"sensor": each.sensor, "unit": each.unit, "by_rig": each.held, "at_best": each.best} for each in self.rms],

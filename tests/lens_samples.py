@@ -12,6 +12,7 @@ from calibkit.simulation.camera import SimCamera, random_board_poses
 from calibkit.simulation.corners import views_of_poses
 
 LENSES = {
+    "pinhole-none": SimCamera(CAMERAS["pinhole-none"], np.array([441.2, 439.8, 366.7, 247.9]), (752, 480)),
     "pinhole-radtan": SimCamera(CAMERAS["pinhole-radtan"], np.array([461.2, 459.8, 366.7, 247.9, -0.28, 0.07, 2e-4, 2e-5]), (752, 480)),
     "pinhole-radtan5": SimCamera(
         CAMERAS["pinhole-radtan5"], np.array([556.2, 555.8, 483.4, 290.6, -0.31, 0.13, 1e-4, -2e-4, -0.03]), (960, 600)

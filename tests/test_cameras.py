@@ -7,6 +7,7 @@ from calibkit.models.cameras import CAMERAS, CameraModel
 from calibkit.opencv import cv2
 
 LENSES = {
+    "pinhole-none": [458.6, 457.3, 367.2, 248.4],
     "pinhole-radtan": [458.6, 457.3, 367.2, 248.4, -0.283, 0.074, 2e-4, 2e-5],
     "pinhole-radtan5": [1056.2, 1056.3, 958.9, 587.1, -0.130, 0.0955, 3e-4, -2e-4, -0.045],
     "pinhole-radtan8": [610.0, 612.0, 640.0, 360.0, 0.4, -0.2, 1e-4, -3e-4, 0.05, 0.7, -0.1, 0.02],
@@ -61,7 +62,7 @@ def test_pinholes_agree_with_opencv(name: str) -> None:
     params = np.array(LENSES[name])
     points = _points(CAMERAS[name], seed=2)
     K = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1]])
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, params[4:])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, params[4:] if len(params) > 4 else None)
     np.testing.assert_allclose(CAMERAS[name].project(points, params).uv, expected[:, 0], atol=1e-9)
 
 
@@ -77,6 +78,9 @@ def test_equidistant_agrees_with_opencv() -> None:
 def test_points_outside_the_domain_are_not_valid(name: str) -> None:
     model, params = CAMERAS[name], np.array(LENSES[name])
     assert not model.project(np.array([[0.0, 0.0, -1.0]]), params).valid.any()
+    if len(params) == 4:  # nothing folds
+        assert not model.project(np.array([[1.0, 0.0, 0.01]]), params).valid.any()
+        return
     folding = params.copy()
     folding[4], folding[5:] = -0.5, 0  # the radial map turns back at r2 = 2/3 (pinhole), theta2 = 2/3 (equidistant)
     r = np.sqrt(2 / 3)

@@ -213,7 +213,7 @@ MISTAKES = {
     "a topic that is not there": (["corners.csv", "--camera", "/nope"], "/nope"),
     "a name that is none": (["corners.csv", "--camera", "0=corners"], "--camera 0=corners"),
     "one name for two": (["corners.csv", "--camera", "a=corners", "--camera", "a=corners"], "--camera a=corners"),
-    "an unknown model": (["corners.csv", "--model", "pinhole-magic"], "--model pinhole-magic is not known: choose auto, pinhole-radtan"),
+    "an unknown model": (["corners.csv", "--model", "pinhole-magic"], "--model pinhole-magic is not known: choose auto, pinhole-none"),
     "more models than cameras": (["corners.csv", "--model", "kb4", "--model", "pinhole-radtan"], "--model is given 2 times for 1 camera:"),
     "no size": (["corners.csv"], "add --resolution WIDTHxHEIGHT"),
     "half a size": (["corners.csv", "--resolution", "480"], "--resolution 480: write WIDTHxHEIGHT"),

@@ -124,7 +124,7 @@ def _twin(section: str, name: str, of: str) -> Change:
         (_set(*FX, "status", "not observable"), "must have value null"),
         (_set(*FX, "sigma", -1.0), "fx.sigma: input should be greater than or equal to 0"),
         (_set(*FX, "sigma", 5.0), "the sigma of fx is 5, but its covariance says"),
-        (_set(*CAM, "model", "pinhole"), "the camera model 'pinhole' is not known; it may be one of pinhole-radtan"),
+        (_set(*CAM, "model", "pinhole"), "the camera model 'pinhole' is not known; it may be one of pinhole-none"),
         (_set(*CAM, "model", "pinhole-radtan5"), "the parameters of pinhole-radtan5 are fx, fy, cx, cy, k1, k2, p1, p2, k3"),
         (_set(*CAM, "resolution", [752, -480]), "cameras.cam0.resolution.1: input should be greater than 0"),
         (_set(*CAM, "resolution", [752]), "cameras.cam0.resolution.1: field required"),

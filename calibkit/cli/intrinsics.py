@@ -23,7 +23,8 @@ def run(
         list[str] | None,
         typer.Option(
             "--model",
-            help="auto (by held-out error), pinhole-radtan, pinhole-radtan5, pinhole-radtan8, pinhole-equi (kb4); once or per camera.",
+            help="auto (by held-out error), pinhole-none (rectified images), pinhole-radtan, pinhole-radtan5, pinhole-radtan8, "
+            "pinhole-equi (kb4); once or per camera.",
         ),
     ] = None,
     out: options.Out = None,

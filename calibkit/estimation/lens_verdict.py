@@ -19,6 +19,7 @@ from calibkit.solver.trust import FEW_BLOCKS, WEAK, Covariance, grade
 MIN_LOOKS = 3  # orientations, and seconds: two numbers of fx fy cx cy a look, and one look to check them
 _WORSE_MODEL, _WRONG_MODEL = 1.1, 2.0  # held-out error over the best model's
 _NO_MODEL_PX = 1.0
+_RADIAL, _RINGS, _RADIAL_MOST = 0.25, 8, 20.0  # share of the squares, rings, px
 _EXTRAPOLATED_PX = 1.0
 _DROPPED_FRAMES = 0.1
 
@@ -38,11 +39,12 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     camera, lens = fit.views[c].camera, fit.state.lenses[c]
     cov = covariance.corrected[where, where]
     projection = projection_sigma(views, lens, cov)
-    reasons = [*_model_reasons(camera, views.model.name, scores), *_frame_reasons(fit, c)]
-    hopeless = _no_model_fits(camera, scores)
+    hopeless = _no_model_fits(camera, scores) or _wrong_model(fit, c, scores)
+    reasons = _frame_reasons(fit, c) if hopeless else [*_better_model(camera, views.model.name, scores), *_frame_reasons(fit, c)]
     too_few = _too_few_looks(fit, c)
     if too_few:
-        return LensJudgement((Status.NOT_OBSERVABLE,) * len(lens), (Reason(Verdict.FAIL, f"{camera}: {too_few}"), *reasons), projection)
+        reasons = [Reason(Verdict.FAIL, f"{camera}: {too_few}"), *hopeless, *reasons]
+        return LensJudgement((Status.NOT_OBSERVABLE,) * len(lens), tuple(reasons), projection)
     effect = pixel_effect(views, lens, cov)
     moved = _involved(effect, cov)
     known = np.maximum(effect.parameters, np.where(moved, effect.weakest_px, 0.0))
@@ -50,7 +52,7 @@ def judge_lens(fit: LensFit, c: int, covariance: Covariance, scores: Sequence[Mo
     alone = np.sqrt(np.diag(cov)) / border_scales(fit.problem, fit.state.lenses)[where]
     known = np.where(alone > WEAK, np.maximum(known, WEAK), known)
     statuses = tuple(Status(grade(float(px))) for px in known)
-    if hopeless:  # more views of a board that is not what the target says would not help
+    if hopeless:  # more views of a board that is not what the target says, or for a model that does not fit, would not help
         return LensJudgement(statuses, (*hopeless, *reasons), projection)
     reasons += _few_looks_reasons(fit, c)
     reasons += _direction_reasons(fit, c, covariance.variance_factor, cov, effect)
@@ -92,18 +94,46 @@ def _too_few_looks(fit: LensFit, c: int) -> str:
     return ""
 
 
-def _model_reasons(camera: str, model: str, scores: Sequence[ModelScore]) -> list[Reason]:
+def _better_model(camera: str, model: str, scores: Sequence[ModelScore]) -> list[Reason]:
     mine = next((score for score in scores if score.model == model), None)
-    if mine is None or mine.within:
+    if mine is None or mine.within or not mine.error_px > _WORSE_MODEL * scores[0].error_px:
         return []
-    best = scores[0]  # the one to choose
-    if not mine.error_px > _WORSE_MODEL * best.error_px:
+    return [Reason(Verdict.CHECK, f"{camera}: {scores[0].model} fits this lens better: {_compared(mine, scores[0])}")]
+
+
+def _wrong_model(fit: LensFit, c: int, scores: Sequence[ModelScore]) -> list[Reason]:
+    """Say that the model is wrong where another errs by far less, what its residuals look like, and which to take."""
+    views, camera = fit.problem.cameras[c], fit.views[c].camera
+    mine = next((score for score in scores if score.model == views.model.name), None)
+    if mine is None or mine.within or not mine.error_px > _WRONG_MODEL * scores[0].error_px:
         return []
-    wrong = mine.error_px > _WRONG_MODEL * best.error_px
-    text = f"on held-out views {model} errs by {mine.error_px:.2f} px, {best.model} by {best.error_px:.2f} px"
-    if wrong:
-        return [Reason(Verdict.FAIL, f"{camera}: {model} is the wrong model for this lens: {text}; use --model {best.model}")]
-    return [Reason(Verdict.CHECK, f"{camera}: {best.model} fits this lens better: {text}")]
+    share, why = _radial_share(fit, c), ""
+    if share > _RADIAL:
+        lacks = "bends otherwise than its coefficients can" if len(views.model.parameter_names) > 4 else "has no distortion coefficients"
+        why = f"it {lacks}, and {share:.0%} of the residuals' squares are one radial pattern around the image's centre; "
+    text = f"{mine.model} is the wrong model for this lens: {why}{_compared(mine, scores[0])}; use --model {scores[0].model}"
+    return [Reason(Verdict.FAIL, f"{camera}: {text}")]
+
+
+def _compared(mine: ModelScore, best: ModelScore) -> str:
+    return f"on held-out views {mine.model} errs by {mine.error_px:.2f} px, {best.model} by {best.error_px:.2f} px"
+
+
+def _radial_share(fit: LensFit, c: int) -> float:
+    """Return which share of the squares of all found corners' residuals rings around the principal point make: sum n_k m_k^2 / sum |r|^2.
+
+    m_k is the mean radial residual of ring k, the rings of equal width; a corner counts with _RADIAL_MOST px at most.
+    """
+    _, every = fit.residuals(c)
+    found = fit.observed[c] & every.seen
+    arm = fit.problem.cameras[c].uv[found] - fit.state.lenses[c][2:4]
+    px = every.px[found]
+    px = px * np.minimum(1, _RADIAL_MOST / np.maximum(np.linalg.norm(px, axis=-1), 1e-12))[:, None]
+    radius = np.linalg.norm(arm, axis=-1)
+    radial = np.sum(px * arm, axis=-1) / np.maximum(radius, 1e-9)
+    ring = np.minimum((radius / max(float(radius.max(initial=0)), 1e-9) * _RINGS).astype(int), _RINGS - 1)
+    total, count = np.bincount(ring, radial, _RINGS), np.bincount(ring, minlength=_RINGS)
+    return float(np.sum(total**2 / np.maximum(count, 1)) / max(float(np.sum(px**2)), 1e-12))
 
 
 def _no_model_fits(camera: str, scores: Sequence[ModelScore]) -> list[Reason]:

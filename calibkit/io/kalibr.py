@@ -26,7 +26,7 @@ _RADTAN = ("k1", "k2", "p1", "p2")
 MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("pinhole", "radtan"): ("pinhole-radtan", _PINHOLE, _RADTAN),
     ("pinhole", "equidistant"): ("pinhole-equi", _PINHOLE, ("k1", "k2", "k3", "k4")),
-    ("pinhole", "none"): ("pinhole-radtan", _PINHOLE, ()),
+    ("pinhole", "none"): ("pinhole-none", _PINHOLE, ()),
     ("pinhole", "fov"): ("pinhole-fov", _PINHOLE, ("w",)),
     ("omni", "radtan"): ("omni-radtan", ("xi", *_PINHOLE), _RADTAN),
     ("omni", "none"): ("omni-radtan", ("xi", *_PINHOLE), ()),

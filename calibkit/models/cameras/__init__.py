@@ -2,9 +2,11 @@
 
 from calibkit.models.cameras.base import CameraModel, Projection
 from calibkit.models.cameras.kannala_brandt import KannalaBrandt
+from calibkit.models.cameras.pinhole import Pinhole
 from calibkit.models.cameras.pinhole_radtan import PinholeRadtan
 
 _MODELS: tuple[CameraModel, ...] = (
+    Pinhole(),
     PinholeRadtan("pinhole-radtan", 4),
     PinholeRadtan("pinhole-radtan5", 5),
     PinholeRadtan("pinhole-radtan8", 8),

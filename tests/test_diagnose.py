@@ -14,17 +14,20 @@ import pytest
 from conftest import Run
 from joint_samples import TD, Recording, of_camera
 from recorded_files import table, write_imu
+from scipy.optimize import least_squares
 from time_offset_samples import camera_session
 
 from calibkit.estimation.diagnosis import Cause, Diagnosis, Evidence, Suspect, diagnose
+from calibkit.estimation.diagnosis_words import About, bending, in_words
 from calibkit.estimation.joint_problem import Drift
 from calibkit.estimation.joint_state import CameraState
 from calibkit.estimation.joint_suspects import Known, evidence, mount
 from calibkit.estimation.joint_trust import joint_trust
-from calibkit.geometry import se3
+from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.io.rig_file import save_rig
 from calibkit.models.board import AprilGrid
+from calibkit.models.cameras import CAMERAS
 from calibkit.models.imu import ImuModel
 from calibkit.simulation.corners import views_of_poses
 from calibkit.simulation.session import START_NS, Session
@@ -191,6 +194,24 @@ def test_the_fewest_causes_are_taken_and_those_that_are_alike_are_told() -> None
     found = diagnose(Evidence(np.array([10.0, 0.0]), cov, mixed, np.ones(2), 1e6), alike)
     assert [cause.key for cause in found.causes] == ["a"]
     assert found.causes[0].alike == ("b",)
+
+
+@pytest.mark.slow
+def test_a_lens_that_bends_otherwise_is_told_by_what_turning_and_focusing_anew_leaves() -> None:
+    """Against a search of the turn and of fx fy cx cy that leave least, over the corners alone."""
+    model, lens = CAMERAS["pinhole-radtan"], np.array([460.0, 458, 366, 248, -0.28, 0.07, 0, 0])
+    step, uv = np.array([0.003, -0.002, 1e-4, 0.0]), np.random.default_rng(0).uniform([60, 40], [690, 440], (300, 2))
+    rays, _ = model.unproject(uv, lens)
+
+    def left(x: Array) -> Array:
+        return model.project(rays @ so3.exp(x[:3]).T, lens + np.concatenate([x[3:], step])).uv - uv
+
+    best = least_squares(lambda x: left(x).ravel(), np.zeros(7), x_scale=[1e-3] * 3 + [1.0] * 4, xtol=1e-14).x
+    about = About(("cam0",), "imu0", (model,), (lens,), (uv,))
+    found = bending(step, about, 0)[1]
+    np.testing.assert_allclose(found, left(best), atol=0.02 * np.abs(found).max())
+    told = in_words(Cause("distortion 0", step, 1e-8 * np.eye(4), -50.0, 0.9), about)
+    assert f"corners are off by {np.sqrt(np.mean(np.sum(found**2, axis=1))):.2g} px rms" in told.text
 
 
 def test_chance_names_a_cause_in_one_of_a_hundred() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from calibkit.estimation.diagnosis import Cause
 from calibkit.estimation.joint_state import LINE_SCALE
-from calibkit.estimation.pixel_grid import grid
+from calibkit.estimation.pixel_grid import bent
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CameraModel
 
@@ -22,7 +22,7 @@ class About:
     imu: str
     models: tuple[CameraModel, ...]
     lenses: tuple[Array, ...]
-    sizes: tuple[tuple[int, int], ...]
+    corners: tuple[Array, ...]  # (n, 2) px where each camera saw the board
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ def in_words(cause: Cause, about: About) -> Told:
     per = _PER.get(drift, "")
     said = say(about.cameras[k], about.imu, theta, f"{size} {unit}{per}", bool(drift))
     if name == "distortion":
-        said += f", up to {_worst_px(cause.theta, about, k):.2g} px at the image's edge"
+        off = np.linalg.norm(bending(cause.theta, about, k)[1], axis=1)
+        said += f": corners are off by {np.sqrt(np.mean(off**2)):.2g} px rms, {off.max():.2g} px at most, focal length and centre set anew"
     cure = _DRIFTS[drift] if drift else mend
     mended = cure.format(camera=about.cameras[k], imu=about.imu)
     alike = tuple(named(key, about) for key in cause.alike)
@@ -69,12 +70,11 @@ def number(value: float, sigma: float) -> str:
     return f"{value:.{digits}f} +- {sigma:.{digits}f}"
 
 
-def _worst_px(theta: Array, about: About, c: int) -> float:
-    model, lens = about.models[c], about.lenses[c]
-    rays, valid = model.unproject(grid(about.sizes[c]), lens)
-    projection = model.project(rays[valid], lens, jacobians=True)
-    assert projection.J_params is not None
-    return float(np.max(np.linalg.norm(projection.J_params[:, :, 4:] @ theta, axis=1)))
+def bending(theta: Array, about: About, c: int) -> tuple[Array, Array]:
+    """Return pixels (n, 2) where camera c saw corners, and how far coefficients off by theta move them, all else set anew."""
+    uv = about.corners[c]
+    rays, valid = about.models[c].unproject(uv, about.lenses[c])
+    return uv[valid], bent(about.models[c], about.lenses[c], rays[valid], theta)
 
 
 Say = Callable[[str, str, Array, str, bool], str]

@@ -28,3 +28,18 @@ def turned_jacobian(model: CameraModel, lens: Array, rays: Array, fit_at: Mask) 
     absorb = np.linalg.lstsq(J_R[fit_at].reshape(-1, 3), -J[fit_at].reshape(-1, J.shape[-1]), rcond=None)[0]
     turned: Array = J + J_R @ absorb
     return turned
+
+
+def bent(model: CameraModel, lens: Array, rays: Array, step: Array) -> Array:
+    """Return how far (n, 2) px a step of the lens's coefficients moves far points, less what camera, focal length and centre make up for.
+
+    du = J_k step - J_R phi - J_f f: phi and f, the steps of fx fy cx cy, leave least over the rays (n, 3).
+    """
+    projection = model.project(rays, lens, jacobians=True)
+    assert projection.J_params is not None
+    assert projection.J_point is not None
+    moved = projection.J_params[..., 4:] @ step
+    others = np.concatenate([projection.J_point @ hat(rays), projection.J_params[..., :4]], axis=-1)
+    made_up = np.linalg.lstsq(others.reshape(-1, others.shape[-1]), moved.ravel(), rcond=None)[0]
+    left: Array = moved - others @ made_up
+    return left

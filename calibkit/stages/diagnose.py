@@ -176,7 +176,7 @@ def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | 
         read.imu_name,
         tuple(CAMERAS[lens.model] for lens in read.lenses),
         tuple(camera.lens for camera in x.cameras),
-        tuple(views.image_size for views in read.views),
+        tuple(frames.views.uv[frames.views.weight > 0] for frames in problem.cameras),
     )
     diagnosed = Diagnosed(
         _what(joint, read),

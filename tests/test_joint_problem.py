@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from calibkit.estimation.camera_problem import CameraViews
+from calibkit.estimation.joint_inertial import ImuBeside, ImuRows
 from calibkit.estimation.joint_noise import draw
 from calibkit.estimation.joint_parts import projected
-from calibkit.estimation.joint_problem import Frames, GravityPrior, ImuRows, JointProblem
-from calibkit.estimation.joint_state import EXTRAS, KNOT, CameraState, JointState
+from calibkit.estimation.joint_problem import Frames, GravityPrior, JointProblem
+from calibkit.estimation.joint_state import EXTRAS, IMU_MODEL, CameraState, ImuState, JointState
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
@@ -19,24 +20,26 @@ from calibkit.models.imu import ImuModel
 from calibkit.solver.banded import Banded
 
 LENS = np.array([461.2, 459.8, 366.7, 247.9, -0.28, 0.07, 2e-4, 2e-5])
-KINDS = ("gyro", "accel", "camera 0", "camera 1", "walk", "stays")
+KINDS = ("gyro", "accel", "gyro 1", "accel 1", "camera 0", "camera 1", "walk", "stays")
 
 
 def small(order: int = 4, extras: tuple[str, ...] = (), seed: int = 0) -> tuple[JointProblem, JointState]:
-    """Return a problem of a few knots with two cameras, measurements that nothing fits, and a state."""
+    """Return a problem of a few knots with two cameras and two IMUs, measurements that nothing fits, and a state."""
     rng = np.random.default_rng(seed)
     knots = Knots(0.0, 0.1, order, 8)
     m = knots.controls
     grid = np.stack(np.meshgrid(np.arange(5) * 0.1, np.arange(4) * 0.1), axis=-1).reshape(-1, 2)
     points = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
-    t = np.sort(rng.uniform(0, 0.8, 60))
-    imu = ImuRows(
-        t,
-        rng.standard_normal((60, 3)),
-        9 * rng.standard_normal((60, 3)),
-        rng.uniform(0.1, 1, 6),
-        rng.uniform(0.1, 1, 6),
-        rng.random((60, 2)) > 0.1,
+    imu, other = (
+        ImuRows(
+            np.sort(rng.uniform(0.05, 0.75, n)),
+            rng.standard_normal((n, 3)),
+            9 * rng.standard_normal((n, 3)),
+            rng.uniform(0.1, 1, 6),
+            rng.uniform(0.1, 1, 6),
+            rng.random((n, 2)) > 0.1,
+        )
+        for n in (60, 40)
     )
     R = so3.exp(np.cumsum(0.1 * rng.standard_normal((m, 3)), axis=0)) @ np.diag([1.0, -1.0, -1.0])
     p = np.array([0.2, 0.15, 0.8]) + 0.05 * rng.standard_normal((m, 3))
@@ -47,16 +50,31 @@ def small(order: int = 4, extras: tuple[str, ...] = (), seed: int = 0) -> tuple[
         cameras.append(Frames(rng.uniform(0.05, 0.7, f), CameraViews(CAMERAS["pinhole-radtan"], np.arange(f), uv, weight, (752, 480))))
         T = se3.make(so3.exp(0.1 * rng.standard_normal(3)), 0.05 * rng.standard_normal(3))
         states.append(CameraState(T, 0.02 * rng.standard_normal(), LENS * (1 + 0.01 * rng.standard_normal(8))))
+    models = [
+        ImuModel(
+            M_a=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
+            M_g=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
+            C_g_i=so3.exp(0.1 * rng.standard_normal(3)),
+            A_g=0.01 * rng.standard_normal((3, 3)),
+        )
+        for _ in range(3)
+    ]
+    free = tuple(name for name in IMU_MODEL if name in extras)
+    count = sum(EXTRAS[name] for name in free)
     problem = JointProblem(
-        knots, points, imu, tuple(cameras), GravityPrior(9.8, 0.02), lens_priors=(None, (LENS, np.diag(1 / LENS**2))), extras=extras
+        knots,
+        points,
+        imu,
+        tuple(cameras),
+        GravityPrior(9.8, 0.02),
+        lens_priors=(None, (LENS, np.diag(1 / LENS**2))),
+        extras=extras,
+        beside=(ImuBeside(other, free, (models[2], np.diag(rng.uniform(1, 5, count))) if free else None),),
     )
-    model = ImuModel(
-        M_a=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
-        M_g=np.eye(3) + np.tril(0.1 * rng.standard_normal((3, 3))),
-        C_g_i=so3.exp(0.1 * rng.standard_normal(3)),
-        A_g=0.01 * rng.standard_normal((3, 3)),
-    )
-    return problem, JointState(R, p, 0.1 * rng.standard_normal((m, 6)), tuple(states), np.array([0.3, -9.0, 2.0]), 1.05, model)
+    placed = se3.make(so3.exp(rng.standard_normal(3)), 0.2 * rng.standard_normal(3))
+    biases = 0.1 * rng.standard_normal((2, m, 6))
+    beside = ImuState(placed, 0.02, biases[1], models[1])
+    return problem, JointState(R, p, biases[0], tuple(states), np.array([0.3, -9.0, 2.0]), 1.05, models[0], (beside,))
 
 
 def cost_of(problem: JointProblem, kind: str) -> Callable[[JointState], float]:
@@ -66,7 +84,7 @@ def cost_of(problem: JointProblem, kind: str) -> Callable[[JointState], float]:
 
 
 def gradient_of(problem: JointProblem, x: JointState, kind: str) -> tuple[Array, Array]:
-    core, border = np.zeros(KNOT * problem.knots.controls), np.zeros(problem.border.size)
+    core, border = np.zeros(problem.border.knot * problem.knots.controls), np.zeros(problem.border.size)
     for part in problem.parts(x):
         if part.kind == kind:
             q = len(part.offsets)
@@ -81,16 +99,16 @@ def test_the_jacobians_are_those_of_differences(order: int, extras: tuple[str, .
     """d cost = -2 (J^T r) d for single unknowns of every sort: residuals are far from 0, so a wrong J shows."""
     problem, x = small(order, extras)
     core, border = gradient_of(problem, x, kind)
-    cost, m, p = cost_of(problem, kind), problem.knots.controls, problem.border.size
+    cost, m, knot, p = cost_of(problem, kind), problem.knots.controls, problem.border.knot, problem.border.size
     # The walk of turns (stays) takes d log(R^T R') for the difference of perturbations: right for small steps only.
     close = 0.05 if kind == "stays" else 1e-5
     scale = max(np.abs(core).max(), np.abs(border).max())
-    for index in [*range(2 * KNOT, 4 * KNOT), *range(-1, -p - 1, -1)]:
-        d_core, d_border = np.zeros(m * KNOT), np.zeros(p)
+    for index in [*range(2 * knot, 4 * knot), *range(-1, -p - 1, -1)]:
+        d_core, d_border = np.zeros(m * knot), np.zeros(p)
         (d_core if index >= 0 else d_border)[index] = 1.0
         gradient = core @ d_core + border @ d_border
         h = 1e-6
-        ends = [cost(problem.retract(x, sign * h * d_core.reshape(m, KNOT), sign * h * d_border)) for sign in (-1, 1)]
+        ends = [cost(problem.retract(x, sign * h * d_core.reshape(m, knot), sign * h * d_border)) for sign in (-1, 1)]
         assert -2 * gradient == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=close, abs=close * scale), index
 
 
@@ -101,7 +119,7 @@ def test_the_priors_gradient() -> None:
     m, p, h = problem.knots.controls, problem.border.size, 1e-6
     for index in range(p):
         d = np.eye(p)[index]
-        ends = [problem.prior(problem.retract(x, np.zeros((m, KNOT)), sign * h * d))[0] for sign in (-1, 1)]
+        ends = [problem.prior(problem.retract(x, np.zeros((m, problem.border.knot)), sign * h * d))[0] for sign in (-1, 1)]
         assert -2 * g[index] == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-4, abs=1e-3)
 
 

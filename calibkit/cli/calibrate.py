@@ -18,7 +18,7 @@ def run(
     target: options.Target,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")],
     camera: options.Cameras = None,
-    imu: options.OneOfImus = None,
+    imu: options.Imus = None,
     model: Annotated[
         list[str] | None, typer.Option("--model", help="Lens model, as for intrinsics; once or per camera. [default: by held-out error]")
     ] = None,
@@ -53,7 +53,7 @@ def run(
     asked = Options(
         cameras=tuple(camera or ()),
         models=tuple(model or (AUTO,)),
-        imu=options.one_imu(imu),
+        imus=tuple(imu or ()),
         reading=ImuOptions(rate, gyro_unit, accel_unit),
         gravity=options.gravity_of(gravity, latitude, altitude),
         resolution=options.size_of(resolution),

@@ -43,7 +43,7 @@ def run(
 
     known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force)
     read = options.sensors(
-        camera, imu, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
+        camera, [imu] if imu else None, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
     asked = Options(**read, temperature=temperature)
     tell(run_diagnosis(sources, target, known, asked, bar), json_file, force)

@@ -16,7 +16,7 @@ def run(
     sources: options.BoardAndImu,
     target: options.Target,
     camera: options.CamerasOfRig = None,
-    imu: options.OneOfImus = None,
+    imu: options.Imus = None,
     out: options.Out = None,
     rig: options.Rigs = None,
     report: options.Report = None,
@@ -62,7 +62,7 @@ def run(
     if knots is not None and not 2 <= knots <= 500:
         raise BadInputError(f"--knots {knots:g}: give 2 to 500 ms")
     read = options.sensors(
-        camera, options.one_imu(imu), (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
+        camera, imu, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
     asked = Options(
         **read,

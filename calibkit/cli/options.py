@@ -32,8 +32,8 @@ Temperature = Annotated[
     typer.Option("--temperature", metavar="FILE", help="CSV with t, temperature [C], on the IMU's clock: what goes with it is named."),
 ]
 Imu = Annotated[str | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic. [default: the only one]")]
-OneOfImus = Annotated[
-    list[str] | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic; one a run. [default: the only one]")
+Imus = Annotated[
+    list[str] | None, typer.Option("--imu", metavar="TOPIC", help="IMU topic, or imu0=/topic; repeatable. [default: the only one]")
 ]
 Out = Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT.yaml", help="Write the rig file, the report's data beside it.")]
 Rigs = Annotated[list[Path] | None, typer.Option("--rig", metavar="IN.yaml", help="Rig files to add the result to; repeatable.")]
@@ -78,7 +78,7 @@ def outputs_of(
 
 def sensors(
     camera: list[str] | None,
-    imu: str | None,
+    imus: list[str] | None,
     reading: tuple[float | None, str | None, str | None],
     gravity: "Gravity",
     no_cache: bool,
@@ -89,7 +89,7 @@ def sensors(
 
     return {
         "cameras": tuple(camera or ()),
-        "imu": imu,
+        "imus": tuple(imus or ()),
         "reading": ImuOptions(*reading),
         "gravity": gravity,
         "cache": not no_cache,
@@ -112,17 +112,6 @@ def tested(
     if json_file is not None:
         refuse_unwritable(json_file, force)
     return merge_rigs([(path, load_rig(path)) for path in rigs])
-
-
-def one_imu(asked: list[str] | None) -> str | None:
-    """Return the IMU of `--imu`; BadInputError where there are several."""
-    from calibkit.errors import BadInputError, one_line
-
-    if asked and len(asked) > 1:
-        those = " and ".join(f"--imu {one_line(each)}" for each in asked)
-        text = "one IMU a run; run joint once for each (--imu imu0=/a, then --imu imu1=/b) on the same rig file"
-        raise BadInputError(f"{those}: {text}: T_imu0_imu1 = T_cam0_imu0^-1 T_cam0_imu1")
-    return asked[0] if asked else None
 
 
 def size_of(text: str | None) -> tuple[int, int] | None:

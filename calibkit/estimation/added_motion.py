@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibkit.estimation.joint_fit import JointFit
+from calibkit.estimation.joint_inertial import ImuRows
 from calibkit.estimation.joint_noise import schur
-from calibkit.estimation.joint_problem import Frames, ImuRows, JointProblem
-from calibkit.estimation.joint_state import JointState
+from calibkit.estimation.joint_problem import Frames, JointProblem
+from calibkit.estimation.joint_state import ImuState, JointState
 from calibkit.estimation.joint_trust import Trust
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -100,14 +101,20 @@ def _moved(fit: JointFit, turn: Array, move: Array) -> Arrowhead:
     phase = np.sin(2 * np.pi * HZ * t)[:, None]
     T_start = se3.make(so3.exp(phase * turn), phase * move)  # of the camera at t in the camera at the start
     T_world_imu = start @ T_start @ x.cameras[0].T_cam_imu
-    state = replace(x, R=T_world_imu[:, :3, :3], p=T_world_imu[:, :3, 3], bias=np.tile(x.bias.mean(axis=0), (knots.controls, 1)))
-    rate = 1 / float(np.median(np.diff(problem.imu.t)))
-    rows = np.arange(0, DURATION_S, 1 / rate)
-    nothing = np.zeros((len(rows), 3))
-    imu = ImuRows(rows, nothing, nothing, problem.imu.sigma, problem.imu.walk, np.ones((len(rows), 2), bool))
-    motion = replace(problem, knots=knots, imu=imu, loss_scale=np.inf)
+    biases = [np.tile(imu.bias.mean(axis=0), (knots.controls, 1)) for imu in x.imus]
+    beside = tuple(replace(imu, bias=bias) for imu, bias in zip(x.beside, biases[1:], strict=True))
+    state = replace(x, R=T_world_imu[:, :3, :3], p=T_world_imu[:, :3, 3], bias=biases[0], beside=beside)
+    imus = [_samples(rows, imu) for rows, imu in zip(problem.imus, x.imus, strict=True)]
+    motion = replace(problem.with_imus(imus), knots=knots, loss_scale=np.inf)
     cameras = tuple(_frames(motion, state, c) for c in range(len(problem.cameras)))
     return replace(motion, cameras=cameras).linearize(state)[1]
+
+
+def _samples(rows: ImuRows, imu: ImuState) -> ImuRows:
+    """Return an IMU's samples of the motion, whose values do not matter."""
+    t = np.arange(0, DURATION_S, float(np.median(np.diff(rows.t)))) - imu.dt
+    nothing = np.zeros((len(t), 3))
+    return replace(rows, t=t, gyro=nothing, accel=nothing, keep=np.ones((len(t), 2), bool))
 
 
 def _best_seen(problem: JointProblem, x: JointState) -> Array:

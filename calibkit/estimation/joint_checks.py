@@ -87,7 +87,8 @@ def _halves(fit: JointFit) -> Halves | None:
 
 
 def _with_calibration(x: JointState, of: JointState) -> JointState:
-    return replace(x, cameras=of.cameras, gravity=of.gravity, board_scale=of.board_scale, imu=of.imu)
+    beside = tuple(replace(known, bias=imu.bias) for imu, known in zip(x.beside, of.beside, strict=True))
+    return replace(x, cameras=of.cameras, gravity=of.gravity, board_scale=of.board_scale, imu=of.imu, beside=beside)
 
 
 def _refit(problem: JointProblem, x: JointState) -> JointFit:
@@ -102,13 +103,14 @@ def part_of(problem: JointProblem, x: JointState, segments: slice) -> tuple[Join
     whole = problem.knots
     knots = Knots(whole.start + segments.start * whole.spacing, whole.spacing, whole.order, segments.stop - segments.start)
     end = knots.start + knots.segments * knots.spacing
-    imu = problem.imu
-    rows = (imu.t >= knots.start) & (imu.t < end)
-    cameras = []
+    imus, cameras = [], []
+    for rows, imu in zip(problem.imus, x.imus, strict=True):
+        inside = (rows.t + imu.dt >= knots.start) & (rows.t + imu.dt < end)
+        imus.append(replace(rows, t=rows.t[inside], gyro=rows.gyro[inside], accel=rows.accel[inside], keep=rows.keep[inside]))
     for frames, camera in zip(problem.cameras, x.cameras, strict=True):
         inside = (frames.t + camera.dt >= knots.start) & (frames.t + camera.dt < end)
         cameras.append(replace(frames, t=frames.t[inside], views=rows_of(frames.views, inside)))
-    imu = replace(imu, t=imu.t[rows], gyro=imu.gyro[rows], accel=imu.accel[rows], keep=imu.keep[rows])
     controls = slice(segments.start, segments.stop + whole.order - 1)
-    state = replace(x, R=x.R[controls], p=x.p[controls], bias=x.bias[controls])
-    return replace(problem, knots=knots, imu=imu, cameras=tuple(cameras)), state
+    beside = tuple(replace(imu, bias=imu.bias[controls]) for imu in x.beside)
+    state = replace(x, R=x.R[controls], p=x.p[controls], bias=x.bias[controls], beside=beside)
+    return replace(problem.with_imus(imus), knots=knots, cameras=tuple(cameras)), state

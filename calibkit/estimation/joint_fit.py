@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibkit.estimation.joint_noise import DRAWS, Component, Drawn, components, draw
 from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import JointState
+from calibkit.estimation.joint_state import JointState, of_imu
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Steps
@@ -102,8 +102,10 @@ def corner_residuals(problem: JointProblem, x: JointState, c: int) -> tuple[Arra
 
 def _robust_scales(problem: JointProblem, x: JointState, found: Sequence[Array]) -> dict[str, float]:
     """Return real over stated sigma of each kind, by the median length of its residuals."""
-    r = problem.imu_residuals(x) / problem.imu.sigma
-    scales = {kind: float(np.median(np.linalg.norm(r[:, part], axis=1)) / _RAYLEIGH_3) for kind, part in _PARTS.items()}
+    scales: dict[str, float] = {}
+    for j, rows in enumerate(problem.imus):
+        r = problem.imu_residuals(x, j) / rows.sigma
+        scales |= {of_imu(kind, j): float(np.median(np.linalg.norm(r[:, part], axis=1)) / _RAYLEIGH_3) for kind, part in _PARTS.items()}
     for c, weight in enumerate(found):
         px, valid = corner_residuals(problem, x, c)
         seen = (weight > 0) & valid
@@ -118,21 +120,26 @@ def _rescaled(problem: JointProblem, scales: dict[str, float], factors: dict[str
     """Return the problem with sigmas multiplied; `factors` keeps the products."""
     for kind, scale in scales.items():
         factors[kind] = factors.get(kind, 1.0) * scale
-    sigma = problem.imu.sigma * np.repeat([scales["gyro"], scales["accel"]], 3)
+    imus = [
+        replace(rows, sigma=rows.sigma * np.repeat([scales[of_imu(kind, j)] for kind in _PARTS], 3)) for j, rows in enumerate(problem.imus)
+    ]
     cameras = tuple(
         replace(frames, views=replace(frames.views, weight=frames.views.weight / scales[f"camera {c}"]))
         for c, frames in enumerate(problem.cameras)
     )
-    return replace(problem, imu=replace(problem.imu, sigma=sigma), cameras=cameras)
+    return replace(problem.with_imus(imus), cameras=cameras)
 
 
 def _without_outliers(problem: JointProblem, x: JointState, found: Sequence[Array], factors: dict[str, float]) -> JointProblem:
     """Return the problem without samples and corners that noise does not explain."""
-    r = problem.imu_residuals(x) / problem.imu.sigma
-    keep = np.stack([np.linalg.norm(r[:, part], axis=1) <= _OUTLIER_SAMPLE for part in _PARTS.values()], axis=1)
+    imus = []
+    for j, rows in enumerate(problem.imus):
+        r = problem.imu_residuals(x, j) / rows.sigma
+        keep = np.stack([np.linalg.norm(r[:, part], axis=1) <= _OUTLIER_SAMPLE for part in _PARTS.values()], axis=1)
+        imus.append(replace(rows, keep=keep))
     cameras = []
     for c, (frames, weight) in enumerate(zip(problem.cameras, found, strict=True)):
         px, valid = corner_residuals(problem, x, c)
         fits = valid & (np.linalg.norm(px, axis=-1) * weight <= _OUTLIER_CORNER * factors[f"camera {c}"])
         cameras.append(replace(frames, views=replace(frames.views, weight=np.where(fits, frames.views.weight, 0.0))))
-    return replace(problem, imu=replace(problem.imu, keep=keep), cameras=tuple(cameras))
+    return replace(problem.with_imus(imus), cameras=tuple(cameras))

@@ -12,15 +12,15 @@ _IMU_S, _CAMERA_S = 0.9, 1.0
 _SLOW = 2.5  # usual intervals: less is no gap of a slow camera
 
 
-def gaps_of_imu(joint: Joint, imu: str) -> list[Reason]:
-    """Return where the IMU gave nothing, and where a sensor of it gave one and the same value."""
-    t, found = joint.fit.problem.imu.t, []
+def gaps_of_imu(joint: Joint, imu: str, j: int = 0) -> list[Reason]:
+    """Return where IMU j gave nothing, and where a sensor of it gave one and the same value."""
+    t, frozen, found = joint.fit.problem.imus[j].t, joint.imus[j].frozen, []
     start, gap = t[:-1], np.diff(t)
-    if joint.frozen:
-        stretches = np.array([(each.start_ns, each.end_ns) for each in joint.frozen]) - joint.origin_ns
+    if frozen:
+        stretches = np.array([(each.start_ns, each.end_ns) for each in frozen]) - joint.origin_ns
         begin, end = np.unique(stretches * 1e-9, axis=0).T
         gap = np.where(np.any((start[:, None] >= begin - 1e-6) & (start[:, None] < end), axis=1), 0.0, gap)
-        which = " and ".join(dict.fromkeys(WORDS[each.kind] for each in joint.frozen))
+        which = " and ".join(dict.fromkeys(WORDS[each.kind] for each in frozen))
         text = f"{imu}'s {which} gave one and the same value, {_told(begin, end - begin, 'time')}: frozen, and left out"
         found.append(Reason(Verdict.CHECK, f"{text}; mend its driver or cable"))
     if gap.max() > _IMU_S:

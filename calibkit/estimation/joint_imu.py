@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibkit.data.observations import ImuSamples, ImuUnit
-from calibkit.data.rig import Covariance, Estimate, ImuIntrinsics
+from calibkit.data.rig import Covariance, Estimate, Imu, ImuIntrinsics
 from calibkit.data.transforms import make_covariance
 from calibkit.data.verdict import Status
 from calibkit.errors import BadInputError
 from calibkit.estimation.joint_fit import JointFit
-from calibkit.estimation.joint_state import A_G, BIASES, IMU_MODEL, KNOT, M_A, M_G, PHI
+from calibkit.estimation.joint_state import A_G, IMU_MODEL, M_A, M_G, PHI, biases
 from calibkit.estimation.joint_trust import BIAS_SCALES, EXTRA_SCALES, Trust
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -20,6 +20,15 @@ from calibkit.solver.trust import grade
 
 _LOOSE = 100.0  # times what it must be known to: a tenth of a scale, 0.1 rad
 _BIAS_PARAMETERS = tuple(f"{b}_{axis}" for b in ("b_g", "b_a") for axis in "xyz")  # as they stand on a knot
+
+
+@dataclass(frozen=True)
+class NamedImu:
+    """An IMU by its name, with what entered the fit."""
+
+    name: str
+    input: "ImuInput"
+    before: Imu | None = None  # the rig file's entry
 
 
 @dataclass(frozen=True)
@@ -88,13 +97,13 @@ def _with_priors(imu: ImuInput, covariance: Covariance | None) -> ImuInput:
     return replace(out, information=information if out.extras else None)
 
 
-def intrinsics_of(fit: JointFit, trust: Trust, imu: ImuInput, gravity: float) -> ImuIntrinsics:
-    """Return the rig file's entry: the model as found and the mean of the biases, with their joint covariance."""
-    names, to_rig = _in_the_rig_file(imu, fit.x.imu)
-    cov, plain = (to_rig @ _with_biases(fit, each) @ to_rig.T for each in (trust.cov, trust.covariance.plain))
-    scales = np.concatenate([trust.scales[fit.problem.border.of_model], np.repeat(BIAS_SCALES, 3)]) * imu.factors
+def intrinsics_of(fit: JointFit, trust: Trust, imu: ImuInput, gravity: float, j: int = 0) -> ImuIntrinsics:
+    """Return the rig file's entry of IMU j: the model as found and the mean of the biases, with their joint covariance."""
+    names, to_rig = _in_the_rig_file(imu, fit.x.imus[j].model)
+    cov, plain = (to_rig @ _with_biases(fit, each, j) @ to_rig.T for each in (trust.cov, trust.covariance.plain))
+    scales = np.concatenate([trust.scales[fit.problem.border.of_model(j)], np.repeat(BIAS_SCALES, 3)]) * imu.factors
     statuses = [Status(grade(float(s))) for s in np.sqrt(np.diag(cov)) / scales]
-    values = _measured(fit, imu).values()
+    values = _measured(fit, imu, j).values()
     parameters = {}
     for key in PARAMETERS:
         of = UNITS[imu.unit][key[:3]]
@@ -114,10 +123,10 @@ def intrinsics_of(fit: JointFit, trust: Trust, imu: ImuInput, gravity: float) ->
     )
 
 
-def _measured(fit: JointFit, imu: ImuInput) -> ImuModel:
+def _measured(fit: JointFit, imu: ImuInput, j: int) -> ImuModel:
     """Return the model of what was measured."""
-    x, (accel, gyro) = fit.x.imu, imu.gains
-    bias = fit.x.bias[: fit.problem.knots.segments].mean(axis=0)
+    x, (accel, gyro) = fit.x.imus[j].model, imu.gains
+    bias = fit.x.imus[j].bias[: fit.problem.knots.segments].mean(axis=0)
     return ImuModel(x.M_a * accel, imu.known.b_a + bias[3:] * accel, x.M_g * gyro, x.C_g_i, imu.known.b_g + bias[:3] * gyro, x.A_g * gyro)
 
 
@@ -131,11 +140,11 @@ def _in_the_rig_file(imu: ImuInput, model: ImuModel) -> tuple[list[str], Array]:
     return names, to_rig
 
 
-def _with_biases(fit: JointFit, cov: Array) -> Array:
-    """Return the covariance of the IMU's model and of the mean bias b = L^T x: cov(b, c) = -L^T A^-1 B cov(c), and its own."""
-    core, segments, at = fit.system.core, fit.problem.knots.segments, fit.problem.border.of_model
-    L = np.zeros((fit.problem.knots.controls, KNOT, 6))
-    L[:segments, BIASES] = np.eye(6) / segments
+def _with_biases(fit: JointFit, cov: Array, j: int) -> Array:
+    """Return the covariance of IMU j's model and of the mean bias b = L^T x: cov(b, c) = -L^T A^-1 B cov(c), and its own."""
+    core, segments, at = fit.system.core, fit.problem.knots.segments, fit.problem.border.of_model(j)
+    L = np.zeros((fit.problem.knots.controls, fit.problem.border.knot, 6))
+    L[:segments, biases(j)] = np.eye(6) / segments
     flat = L.reshape(-1, 6)
     answer = flat.T @ fit.drawn.core_answer
     own = flat.T @ core.solve(L).reshape(-1, 6) + answer @ cov @ answer.T

@@ -25,14 +25,14 @@ def sample_sigmas(rates: Array) -> Array:
 class Drawn:
     """The system at the optimum, and states drawn from N(0, H^-1) about it."""
 
-    core: Array  # (m 12, s)
+    core: Array  # (m knot, s)
     border: Array  # (p, s)
-    core_answer: Array  # A^-1 B (m 12, p)
+    core_answer: Array  # A^-1 B (m knot, p)
     S: Array  # (p, p)
 
 
 def schur(system: Arrowhead) -> tuple[Array, Array]:
-    """Return A^-1 B (m 12, p) and S = C - B^T A^-1 B (p, p)."""
+    """Return A^-1 B (m knot, p) and S = C - B^T A^-1 B (p, p)."""
     p = system.corner.shape[0]
     answer = system.core.solve(system.border).reshape(-1, p)
     S: Array = system.corner - system.border.reshape(-1, p).T @ answer

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.estimation.joint_state import KNOT
 from calibkit.geometry.so3 import Array
 from calibkit.solver.arrowhead import Arrowhead
 from calibkit.solver.banded import Banded
@@ -20,7 +19,7 @@ class Part:
 
     kind: str
     t_s: Array  # (n,) time of each epoch
-    first: Index  # (n,) knot whose unknowns the offsets count from
+    first: Index  # (n,) of the core's unknowns, that the offsets count from
     offsets: Index  # (q,) increasing, of the core's columns
     touch: Index  # (b,) the border's columns
     N: Array  # (n, q + b + 1, q + b + 1)
@@ -30,13 +29,13 @@ class Part:
     @property
     def columns(self) -> Index:
         """Return each epoch's unknowns of the core, (n, q)."""
-        return KNOT * self.first[:, None] + self.offsets
+        return self.first[:, None] + self.offsets
 
 
-def assemble(parts: Iterable[Part], knots: int, width: int, p: int) -> tuple[float, Arrowhead]:
-    """Return the cost and the normal equations of all parts; width knots meet in the core."""
-    size, cost = KNOT * knots, 0.0
-    band = np.zeros(KNOT * width * size)
+def assemble(parts: Iterable[Part], knots: int, knot: int, width: int, p: int) -> tuple[float, Arrowhead]:
+    """Return the cost and the normal equations of all parts; a knot has so many unknowns, and width knots meet in the core."""
+    size, cost = knot * knots, 0.0
+    band = np.zeros(knot * width * size)
     B, C, g_x, g_c = np.zeros((size, p)), np.zeros((p, p)), np.zeros(size), np.zeros(p)
     for part in parts:
         q, touch = len(part.offsets), part.touch
@@ -51,14 +50,14 @@ def assemble(parts: Iterable[Part], knots: int, width: int, p: int) -> tuple[flo
             C[np.ix_(touch, touch)] += total[:-1, q:-1]
             g_c[touch] += total[:-1, -1]
         cost += part.cost
-    core = Banded(band.reshape(KNOT * width, size))
-    return cost, Arrowhead(core, B.reshape(knots, KNOT, p), C, g_x.reshape(knots, KNOT), g_c)
+    core = Banded(band.reshape(knot * width, size))
+    return cost, Arrowhead(core, B.reshape(knots, knot, p), C, g_x.reshape(knots, knot), g_c)
 
 
 def projected(part: Part, core_answer: Array) -> tuple[Array, Array]:
     """Return each epoch's information about the border (n, p, p) and its score (n, p), the core answering by dx = -core_answer dc.
 
-    core_answer is A^-1 B (m 12, p): K_c - K_x A^-1 B are the border's columns once the core is eliminated.
+    core_answer is A^-1 B (m knot, p): K_c - K_x A^-1 B are the border's columns once the core is eliminated.
     """
     p, q = core_answer.shape[1], len(part.offsets)
     P = np.empty((len(part.first), q + len(part.touch), p))

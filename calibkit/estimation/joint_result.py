@@ -14,17 +14,17 @@ from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_fit import corner_residuals
-from calibkit.estimation.joint_imu import ImuInput, intrinsics_of
+from calibkit.estimation.joint_imu import NamedImu, intrinsics_of
 from calibkit.estimation.joint_noise import draw
 from calibkit.estimation.joint_rivals import spread
-from calibkit.estimation.joint_state import BIASES, KNOT, LINE, LINE_SCALE
+from calibkit.estimation.joint_state import LINE, LINE_SCALE, biases
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.joint_verdict import Judged, judge_joint, known
 from calibkit.estimation.stamps import StampReport
 from calibkit.estimation.time_offset_result import early_or_late
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
-from calibkit.geometry.spline import Steps, basis
+from calibkit.geometry.spline import Steps, basis, turning
 from calibkit.solver.trust import grade
 
 STAGE = "joint"
@@ -36,70 +36,68 @@ def joint_result(
     trust: Trust,
     checks: Checks,
     cameras: Sequence[CameraInput],
-    imu: str,
-    of_imu: ImuInput,
+    imus: Sequence[NamedImu],
     stamps: dict[str, StampReport],
-    before: Imu | None = None,
 ) -> Result:
-    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera; `before` is the rig file's entry of the IMU."""
+    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera, T_imu_ref and dt_ref_imu of further IMUs."""
     if not _tells_an_offset(joint, trust):  # the motion leaves it open: another solution is no news
         joint = replace(joint, rival=None)
     trust = spread(trust, joint.rival)
-    names = tuple(each.views.camera for each in cameras)
-    judged = judge_joint(joint, trust, checks, cameras, imu, of_imu, stamps)
+    names, imu = tuple(each.views.camera for each in cameras), imus[0].name
+    judged = judge_joint(joint, trust, checks, cameras, imus, stamps)
     fit, border = joint.fit, joint.fit.problem.border
     rig = Rig()
     unknown: list[str] = []
     for c, (name, each) in enumerate(zip(names, cameras, strict=True)):
-        T, dt = f"T_{name}_{imu}", f"dt_{imu}_{name}"
-        where = border[f"T {c}"]
-        cov = trust.cov[where, where]
         x = fit.x.cameras[c]
-        statuses = parameter_statuses(x.T_cam_imu, cov)
-        entry = make_transform(
-            name,
-            imu,
-            x.T_cam_imu,
-            cov,
-            known(judged.statuses, where),
-            statuses=statuses,
-            verdict=judged.verdict(T),
-            reasons=judged.texts(T),
-        )
-        rig.transforms[T] = entry
-        k = border[f"dt {c}"]
-        status = judged.statuses[k.start]
-        offset = _estimate(x.dt, "s", trust, k.start, status)
-        rig.time_offsets[dt] = make_time_offset(imu, name, offset, verdict=judged.verdict(dt), reasons=judged.texts(dt))
+        unknown += _add_pose(rig, trust, judged, (name, imu), x.T_cam_imu, x.dt, (border[f"T {c}"], border[f"dt {c}"].start))
         rig.cameras[name] = _camera(joint, trust, judged, each, c)
-        unknown += [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
-        unknown += [f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else []
         lens = rig.cameras[name]
         unknown += [f"{name}.{key}" for key, value in lens.parameters.items() if value.status is Status.NOT_OBSERVABLE]
         unknown += [f"{name}.line_delay"] if lens.line_delay is not None and lens.line_delay.value is None else []
-    before = before or Imu(rate_hz=round(joint.rate_hz, 3))
-    if of_imu.extras:
-        entry_of_imu = intrinsics_of(fit, trust, of_imu, fit.problem.gravity.size)
-        judgement = {"verdict": judged.verdict(imu), "reasons": judged.texts(imu)}
-        before = before.model_copy(update={"intrinsics": entry_of_imu.model_copy(update=judgement)})
-        unknown += [f"{imu}.{key}" for key, value in entry_of_imu.parameters.items() if value.status is Status.NOT_OBSERVABLE]
-    rig.imus[imu] = before
-    residuals = [*(_corner_set(joint, cameras[c], c) for c in range(len(names))), *_imu_sets(joint, imu)]
+    for j, of_imu in enumerate(imus):
+        name = of_imu.name
+        if j:
+            beside = fit.x.beside[j - 1]
+            where = border[f"T_imu {j}"], border[f"dt_imu {j}"].start
+            unknown += _add_pose(rig, trust, judged, (name, imu), beside.T_imu_ref, beside.dt, where)
+        rig.imus[name] = of_imu.before or Imu(rate_hz=round(joint.imus[j].rate_hz, 3))
+        if of_imu.input.extras:
+            found = intrinsics_of(fit, trust, of_imu.input, fit.problem.gravity.size, j)
+            judgement = {"verdict": judged.verdict(name), "reasons": judged.texts(name)}
+            rig.imus[name] = rig.imus[name].model_copy(update={"intrinsics": found.model_copy(update=judgement)})
+            unknown += [f"{name}.{key}" for key, value in found.parameters.items() if value.status is Status.NOT_OBSERVABLE]
+    of_imus = (each for j, of_imu in enumerate(imus) for each in _imu_sets(joint, of_imu.name, j))
+    residuals = [*(_corner_set(joint, cameras[c], c) for c in range(len(names))), *of_imus]
     return Result(
         stage=STAGE,
         rig=rig,
         reasons=judged.all,
         residuals=tuple(residuals),
         facts={
-            "joint": _facts(joint, trust, checks, names, imu),
+            "joint": _facts(joint, trust, checks, names, [each.name for each in imus]),
             "frame_labels": {
                 name: [each.views.labels[i] for i in rows] for name, each, rows in zip(names, cameras, joint.frames, strict=True)
             },
-            "lines": _lines(joint, trust, checks, names, imu, judged),
+            "lines": _lines(joint, trust, checks, names, [each.name for each in imus], judged),
             "t_zero_ns": dict.fromkeys((each.sensor for each in residuals), joint.origin_ns),
         },
         not_observable=tuple(unknown),
     )
+
+
+def _add_pose(
+    rig: Rig, trust: Trust, judged: Judged, names: tuple[str, str], T_a_b: Array, offset: float, where: tuple[slice, int]
+) -> list[str]:
+    """Add T_a_b and dt_b_a of sensors a and b, and return what of them is not observable."""
+    (a, b), (of_T, k) = names, where
+    T, dt, cov, status = f"T_{a}_{b}", f"dt_{b}_{a}", trust.cov[of_T, of_T], judged.statuses[k]
+    statuses = parameter_statuses(T_a_b, cov)
+    told = {name: {"verdict": judged.verdict(name), "reasons": judged.texts(name)} for name in (T, dt)}
+    rig.transforms[T] = make_transform(a, b, T_a_b, cov, known(judged.statuses, of_T), statuses=statuses, **told[T])
+    rig.time_offsets[dt] = make_time_offset(b, a, _estimate(offset, "s", trust, k, status), **told[dt])
+    open_ = [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
+    return [*open_, *([f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else [])]
 
 
 def _tells_an_offset(joint: Joint, trust: Trust) -> bool:
@@ -191,31 +189,32 @@ def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
     )
 
 
-def _imu_sets(joint: Joint, imu: str) -> list[ResidualSet]:
-    """Return the gyroscope's and the accelerometer's residuals with what was measured, and the way with the biases on it."""
-    fit, rows = joint.fit, joint.fit.problem.imu
-    left = fit.problem.imu_residuals(fit.x)
-    i, _ = fit.problem.knots.locate(rows.t)
-    rate = np.linalg.norm(rows.gyro - left[:, :3] - fit.x.bias[i, :3], axis=1)
+def _imu_sets(joint: Joint, imu: str, j: int) -> list[ResidualSet]:
+    """Return IMU j's gyroscope's and accelerometer's residuals with what was measured, and the way with the biases on it."""
+    fit, rows = joint.fit, joint.fit.problem.imus[j]
+    left = fit.problem.imu_residuals(fit.x, j)
+    i, _ = fit.problem.knots.locate(rows.t + fit.x.imus[j].dt)
+    rate = np.linalg.norm(rows.gyro - left[:, :3] - fit.x.imus[j].bias[i, :3], axis=1)
     sets = []
     for k, (name, unit, measured) in enumerate((("gyro", "rad/s", rows.gyro), ("accel", "m/s^2", rows.accel))):
         part = slice(3 * k, 3 * k + 3)
         sigma = np.full(len(rows.t), float(rows.sigma[part].mean()))
         context = {"measured": measured, "kept": rows.keep[:, k], "rate": rate}
         sets.append(ResidualSet(f"{imu}_{name}", unit, _stamps(joint, rows.t), left[:, part], sigma, context))
-    return [*sets, _way(joint, imu)]
+    return [*sets, _way(joint, imu, j)]
 
 
-def _way(joint: Joint, imu: str) -> ResidualSet:
-    """Return where the IMU was and its biases, once a segment; the residuals are the steps of the biases over their walk's sigma."""
-    fit, knots = joint.fit, joint.fit.problem.knots
-    i = np.arange(knots.segments)
-    value = basis(knots, np.full(knots.segments, 0.5))
-    place = np.einsum("nl,nlk->nk", value, fit.x.p[i[:, None] + np.arange(knots.order)])
-    steps = (fit.x.bias[i + 1] - fit.x.bias[i]) / (fit.problem.imu.walk * np.sqrt(knots.spacing))
-    drawn = draw(fit.system, _BIAS_DRAWS).core.reshape(knots.controls, KNOT, _BIAS_DRAWS)
-    sigma = np.sqrt(np.mean(drawn[i, BIASES] ** 2, axis=2))
-    context = {"place": place, "bias": fit.x.bias[i], "bias_sigma": sigma}
+def _way(joint: Joint, imu: str, j: int) -> ResidualSet:
+    """Return where IMU j was and its biases, once a segment; the residuals are the steps of the biases over their walk's sigma."""
+    fit, knots, own = joint.fit, joint.fit.problem.knots, joint.fit.x.imus[j]
+    i, half = np.arange(knots.segments), np.full(knots.segments, 0.5)
+    value = basis(knots, half)
+    at = turning(fit.x.R, Steps.of(fit.x.R), i, value, basis(knots, half, 1), jacobians=False)
+    place = np.einsum("nl,nlk->nk", value, fit.x.p[i[:, None] + np.arange(knots.order)]) + at.R @ se3.inverse(own.T_imu_ref)[:3, 3]
+    steps = (own.bias[i + 1] - own.bias[i]) / (fit.problem.imus[j].walk * np.sqrt(knots.spacing))
+    drawn = draw(fit.system, _BIAS_DRAWS).core.reshape(knots.controls, fit.problem.border.knot, _BIAS_DRAWS)
+    sigma = np.sqrt(np.mean(drawn[i, biases(j)] ** 2, axis=2))
+    context = {"place": place, "bias": own.bias[i], "bias_sigma": sigma}
     return ResidualSet(imu, "sigma", _stamps(joint, knots.middle(i)), steps, np.ones(knots.segments), context)
 
 
@@ -223,12 +222,13 @@ def _stamps(joint: Joint, t: Array) -> NDArray[np.int64]:
     return np.asarray(joint.origin_ns + np.round(t * 1e9).astype(np.int64))
 
 
-def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str) -> dict[str, object]:
+def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imus: list[str]) -> dict[str, object]:
     """Return everything in SI units, for machines."""
     fit, x = joint.fit, joint.fit.x
     halves = checks.halves
     return {
-        "imu": imu,
+        "imu": imus[0],
+        "imus": imus,
         "cameras": list(names),
         "gravity": x.gravity.tolist(),
         "gravity_sigma": np.sqrt(np.diag(trust.cov)[:3]).tolist(),
@@ -239,7 +239,11 @@ def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], i
             if kind in fit.factors
         },
         "sample_sigma": fit.problem.imu.sigma.tolist(),
-        "knots": {"order": fit.problem.knots.order, "spacing": fit.problem.knots.spacing, "unknowns": 12 * fit.problem.knots.controls},
+        "knots": {
+            "order": fit.problem.knots.order,
+            "spacing": fit.problem.knots.spacing,
+            "unknowns": fit.problem.border.knot * fit.problem.knots.controls,
+        },
         "board_scale": list(checks.board_scale),
         "halves": None
         if halves is None
@@ -250,24 +254,30 @@ def _facts(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], i
     }
 
 
-def _lines(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imu: str, judged: Judged) -> list[str]:
-    fit, x, border, rows = joint.fit, joint.fit.x, joint.fit.problem.border, joint.fit.problem.imu
+def _lines(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], imus: list[str], judged: Judged) -> list[str]:
+    fit, x, border, imu = joint.fit, joint.fit.x, joint.fit.problem.border, imus[0]
     knots = fit.problem.knots
     corners = sum(int((frames.views.weight > 0).sum()) for frames in fit.problem.cameras)
-    root = np.sqrt(joint.rate_hz)
+    samples, frames = sum(len(rows.t) for rows in fit.problem.imus), sum(len(each) for each in joint.frames)
     lines = [
-        f"{', '.join(names)} and {imu}: {corners} corners in {sum(len(each) for each in joint.frames)} frames, {len(rows.t)} samples over "
+        f"{', '.join(names)} and {', '.join(imus)}: {corners} corners in {frames} frames, {samples} samples over "
         f"{knots.segments * knots.spacing:.4g} s; spline of order {knots.order}, a knot every {knots.spacing * 1e3:.3g} ms",
-        f"  noise as the residuals have it: gyroscope {rows.sigma[:3].mean() / root:.2e} rad/s/sqrt(Hz), accelerometer "
-        f"{rows.sigma[3:].mean() / root:.2e} m/s^2/sqrt(Hz)"
-        + "".join(f", corners of {name} {_corner_sigma(joint, c):.3g} px" for c, name in enumerate(names)),
+        *(_noise_line(joint, name if j else "", j) for j, name in enumerate(imus)),
     ]
-    for c, name in enumerate(names):
-        T, k = x.cameras[c].T_cam_imu, border[f"dt {c}"].start
+    lines[1] += "".join(f", corners of {name} {_corner_sigma(joint, c):.3g} px" for c, name in enumerate(names))
+    placed = [
+        *((name, each.T_cam_imu, each.dt, f"dt {c}", judged.opens[c]) for c, (name, each) in enumerate(zip(names, x.cameras, strict=True))),
+        *(
+            (name, each.T_imu_ref, each.dt, f"dt_imu {j}", judged.opens_of_imus[j - 1])
+            for j, (name, each) in enumerate(zip(imus[1:], x.beside, strict=True), 1)
+        ),
+    ]
+    for name, T, offset, block, opens in placed:
+        k = border[block].start
         if judged.statuses[k] is not Status.NOT_OBSERVABLE:
             sigma = 1e3 * float(np.sqrt(trust.cov[k, k]))
-            lines.append(f"  t_{imu} = t_{name} + dt: {early_or_late(name, x.cameras[c].dt)} (+- {sigma:.2g} ms)")
-        if not any(each.grade == "not observable" for each in judged.opens[c]):
+            lines.append(f"  t_{imu} = t_{name} + dt: {early_or_late(name, offset)} (+- {sigma:.2g} ms)")
+        if not any(each.grade == "not observable" for each in opens):
             v, p = np.degrees(so3.log(T[:3, :3])), 1e3 * se3.inverse(T)[:3, 3]
             turned = f"R_{name}_{imu} = exp({v[0]:.4f}, {v[1]:.4f}, {v[2]:.4f}) deg"
             lines.append(f"  {turned}; {name} sits at ({p[0]:.2f}, {p[1]:.2f}, {p[2]:.2f}) mm of {imu}")
@@ -282,6 +292,12 @@ def _lines(joint: Joint, trust: Trust, checks: Checks, names: tuple[str, ...], i
         )
         lines.append(f"  halves agree within {worst:.1f} sigma; the second half under the first one's calibration: {px}")
     return lines
+
+
+def _noise_line(joint: Joint, of: str, j: int) -> str:
+    sigma, root = joint.fit.problem.imus[j].sigma, np.sqrt(joint.imus[j].rate_hz)
+    gyro, accel = f"{sigma[:3].mean() / root:.2e} rad/s/sqrt(Hz)", f"{sigma[3:].mean() / root:.2e} m/s^2/sqrt(Hz)"
+    return f"  noise {f'of {of} ' if of else ''}as the residuals have it: gyroscope {gyro}, accelerometer {accel}"
 
 
 def _corner_sigma(joint: Joint, c: int) -> float:

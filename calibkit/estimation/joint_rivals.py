@@ -7,7 +7,7 @@ import numpy as np
 
 from calibkit.estimation.joint_fit import JointFit, RoughFit, fit_roughly, refine
 from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import LINE, LINE_SCALE, JointState, model_step
+from calibkit.estimation.joint_state import LINE, LINE_SCALE, JointState, model_step, of_imu
 from calibkit.estimation.joint_trust import Trust
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
@@ -43,13 +43,13 @@ def fit_best(starts: Sequence[tuple[JointProblem, JointState]]) -> tuple[JointFi
 
 def _misfit(fit: RoughFit) -> float:
     """Return -2 ln likelihood but for a constant: n ln s^2 of each sensor's noise."""
-    sizes = {"gyro": 3 * len(fit.problem.imu.t), "accel": 3 * len(fit.problem.imu.t)}
+    sizes = {of_imu(kind, j): 3 * len(rows.t) for j, rows in enumerate(fit.problem.imus) for kind in ("gyro", "accel")}
     sizes |= {f"camera {c}": 2 * int(np.count_nonzero(weight)) for c, weight in enumerate(fit.found)}
     return sum(n * 2 * float(np.log(fit.factors[kind])) for kind, n in sizes.items())
 
 
 def _rows(fit: RoughFit) -> int:
-    return 6 * len(fit.problem.imu.t) + 2 * sum(int(np.count_nonzero(weight)) for weight in fit.found)
+    return 6 * sum(len(rows.t) for rows in fit.problem.imus) + 2 * sum(int(np.count_nonzero(weight)) for weight in fit.found)
 
 
 def spread(trust: Trust, rival: Rival | None) -> Trust:
@@ -61,9 +61,13 @@ def border_step(a: JointFit, b: JointFit | RoughFit) -> Array:
     """Return the step of the border from a to b, gravity's left out (0)."""
     border, one, two = a.problem.border, a.x, b.x
     out = np.zeros(border.size)
-    for name, step in model_step(one.imu, two.imu).items():
-        if name in border.extras:
-            out[border[name]] = step
+    for j, (first_imu, second_imu) in enumerate(zip(one.imus, two.imus, strict=True)):
+        steps = model_step(first_imu.model, second_imu.model)
+        for name in border.free_of(j):
+            out[border[of_imu(name, j)]] = steps[name]
+        if j:
+            out[border[f"T_imu {j}"]] = se3.local(first_imu.T_imu_ref, second_imu.T_imu_ref)
+            out[border[f"dt_imu {j}"]] = second_imu.dt - first_imu.dt
     for c, (first, second) in enumerate(zip(one.cameras, two.cameras, strict=True)):
         out[border[f"T {c}"]] = se3.local(first.T_cam_imu, second.T_cam_imu)
         out[border[f"dt {c}"]] = second.dt - first.dt

@@ -12,10 +12,10 @@ from calibkit.estimation.board_poses import BoardPoses
 from calibkit.estimation.joint_accelerations import Accelerations, camera_accelerations, lag_of, rotation_of, turned_about
 from calibkit.estimation.joint_state import CameraState, JointState
 from calibkit.estimation.orientation_track import OrientationTrack
-from calibkit.estimation.time_offset import TimeOffsetFit
+from calibkit.estimation.time_offset import Settings, TimeOffsetFit, fit_time_offset
 from calibkit.estimation.time_offset_start import find_starts
 from calibkit.estimation.time_offset_verdict import ALIKE, judge_time_offset
-from calibkit.estimation.turns import Turns
+from calibkit.estimation.turns import Turns, turns_of_gyro
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots, basis
@@ -52,6 +52,25 @@ def seed_camera(poses: BoardPoses, fit: TimeOffsetFit, imu: ImuSamples) -> Camer
         td_by = STAMPS if lag is None else ACCELERATIONS
         td = lag if lag is not None else 0.0 if _overlap(poses, imu) else td
     return _turned(replace(by_turns, td=td, td_by=td_by), camera, axes, imu)
+
+
+@dataclass(frozen=True)
+class ImuSeed:
+    """A further IMU's start."""
+
+    R_imu_ref: Array  # (3, 3)
+    td: float  # s, t_ref = t_imu + td
+    turns: TimeOffsetFit  # of its gyroscope against the reference's
+
+
+def seed_imu(imu: ImuSamples, reference: ImuSamples, poses: BoardPoses, turned: Turns, seed: CameraSeed) -> ImuSeed:
+    """Return a further IMU's start: as both gyroscopes turn, or through a camera where those do not tell."""
+    fit = fit_time_offset(turns_of_gyro(imu), reference, Settings())
+    judged = judge_time_offset("dt", "ref", "imu", fit, {})
+    if judged.status is not Status.NOT_OBSERVABLE and not len(open_axes(fit.alignment)):
+        return ImuSeed(fit.alignment.R, fit.td, fit)
+    through = seed_camera(poses, fit_time_offset(turned, imu, Settings()), imu)
+    return ImuSeed(through.R_cam_imu.T @ seed.R_cam_imu, seed.td - through.td, fit)
 
 
 def _turned(seed: CameraSeed, camera: Accelerations | None, axes: Array, imu: ImuSamples) -> CameraSeed:

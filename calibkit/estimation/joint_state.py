@@ -1,6 +1,8 @@
 """The unknowns of the joint estimator: a trajectory with biases on its knots (the core), cameras and gravity (the border)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +11,12 @@ from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.models.imu import ACCEL_PARAMETERS, GYRO_PARAMETERS, SENSITIVITY_PARAMETERS, ImuModel, lower
 
-KNOT = 12  # unknowns of a knot: rotation, position, gyroscope's bias, accelerometer's bias
-ROTATION, POSITION, BIASES = slice(0, 3), slice(3, 6), slice(6, 12)
+ROTATION, POSITION = slice(0, 3), slice(3, 6)  # of a knot's unknowns; then each IMU's biases, gyroscope first
+
+
+def biases(j: int) -> slice:
+    """Return where IMU j's biases stand among a knot's unknowns."""
+    return slice(6 + 6 * j, 12 + 6 * j)
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,16 @@ class CameraState:
 
 
 @dataclass(frozen=True)
+class ImuState:
+    """One IMU on the rig: p_imu = T_imu_ref p_ref, t_ref = t_imu + dt, ref being the first IMU, whose way the trajectory is."""
+
+    T_imu_ref: Array  # (4, 4)
+    dt: float  # s
+    bias: Array  # (m, 6) rad/s, m/s^2
+    model: ImuModel = field(default_factory=ImuModel)
+
+
+@dataclass(frozen=True)
 class JointState:
     """Control points of T_world_imu, the world being the board's frame; biases are constant over a segment, that of its first knot."""
 
@@ -34,6 +50,11 @@ class JointState:
     gravity: Array  # (3,) m/s^2 in the board's frame, pointing down
     board_scale: float = 1.0  # of the board over what its file says
     imu: ImuModel = field(default_factory=ImuModel)  # its biases are not used: they are on the knots
+    beside: tuple[ImuState, ...] = ()  # further IMUs
+
+    @property
+    def imus(self) -> tuple[ImuState, ...]:
+        return ImuState(np.eye(4), 0.0, self.bias, self.imu), *self.beside
 
 
 # What is free on request, and what is suspected where it is not: names with the number of unknowns.
@@ -51,10 +72,13 @@ class Border:
     lens_sizes: tuple[int, ...]
     extras: tuple[str, ...] = ()
     drifts: tuple[str, ...] = ()  # names of what T, dt and focal length go with
+    beside: tuple[tuple[str, ...], ...] = ()  # of further IMUs: what is free of the model, of IMU_MODEL
 
-    @property
+    @cached_property
     def _blocks(self) -> dict[str, slice]:
         sizes = {"gravity": 3, **{name: size for name, size in EXTRAS.items() if name in self.extras and name != LINE}}
+        for j, free in enumerate(self.beside, 1):
+            sizes |= {f"T_imu {j}": 6, f"dt_imu {j}": 1, **{of_imu(name, j): EXTRAS[name] for name in IMU_MODEL if name in free}}
         for c, lens in enumerate(self.lens_sizes):
             sizes |= {f"T {c}": 6, f"dt {c}": 1, f"lens {c}": lens, **({f"{LINE} {c}": 1} if LINE in self.extras else {})}
         sizes |= {f"{drift} {c}": DRIFTING for drift in self.drifts for c in range(len(self.lens_sizes))}
@@ -64,7 +88,11 @@ class Border:
         return out
 
     def __getitem__(self, name: str) -> slice:
-        """Return where "gravity", an extra of the IMU, or "T c", "dt c", "lens c", "line delay c", "DRIFT c" of camera c stands."""
+        """Return where a block stands.
+
+        "gravity"; an extra of the first IMU; "T_imu j", "dt_imu j", `of_imu(NAME, j)` of another; "T c", "dt c", "lens c", "line delay c",
+        "DRIFT c" of camera c.
+        """
         return self._blocks[name]
 
     def camera(self, c: int) -> slice:
@@ -72,23 +100,36 @@ class Border:
         last = f"{LINE if LINE in self.extras else 'lens'} {c}"
         return slice(self[f"T {c}"].start, self[last].stop)
 
-    @property
-    def of_model(self) -> NDArray[np.int64]:
-        """Return where what is free of the IMU's model stands, in the order of IMU_MODEL."""
-        return np.array([k for name in IMU_MODEL if name in self.extras for k in range(self[name].start, self[name].stop)], np.int64)
+    def at(self, names: Iterable[str]) -> NDArray[np.int64]:
+        """Return where blocks stand, one after the other."""
+        return np.array([k for name in names for k in range(self[name].start, self[name].stop)], np.int64)
+
+    def free_of(self, j: int) -> tuple[str, ...]:
+        """Return what is free of IMU j's model, in the order of IMU_MODEL."""
+        free = self.extras if j == 0 else self.beside[j - 1]
+        return tuple(name for name in IMU_MODEL if name in free)
+
+    def of_model(self, j: int = 0) -> NDArray[np.int64]:
+        """Return where what is free of IMU j's model stands, in the order of IMU_MODEL."""
+        return self.at(of_imu(name, j) for name in self.free_of(j))
 
     @property
-    def of_imu(self) -> slice:
-        """Return gravity and what is free of the IMU and of the board's size."""
-        return slice(0, self["T 0"].start)
+    def knot(self) -> int:
+        """Return how many unknowns a knot has."""
+        return int(biases(len(self.beside)).stop)
 
     @property
     def size(self) -> int:
         return int(max(block.stop for block in self._blocks.values()))
 
 
+def of_imu(name: str, j: int) -> str:
+    """Return what a block of the border is called for IMU j, which the first one's is called `name`."""
+    return name if j == 0 else f"{name} {j}"
+
+
 def retract(x: JointState, where: Border, core: Array, border: Array) -> JointState:
-    """Return the state moved by steps of the core (m, 12) and the border (p,)."""
+    """Return the state moved by steps of the core (m, knot) and the border (p,)."""
 
     def step(name: str) -> Array:
         return border[where[name]]
@@ -102,22 +143,32 @@ def retract(x: JointState, where: Border, core: Array, border: Array) -> JointSt
         )
         for c, camera in enumerate(x.cameras)
     )
-    moved = {name: step(name) for name in where.extras if name != LINE}
-    imu = replace(
-        x.imu,
-        M_a=x.imu.M_a + lower(moved.get(M_A, _NO_6)),
-        M_g=x.imu.M_g + lower(moved.get(M_G, _NO_6)),
-        C_g_i=x.imu.C_g_i @ so3.exp(moved.get(PHI, _NO_3)),
-        A_g=x.imu.A_g + moved.get(A_G, _NO_9).reshape(3, 3),
+    models = [_moved(each.model, {name: step(of_imu(name, j)) for name in where.free_of(j)}) for j, each in enumerate(x.imus)]
+    beside = tuple(
+        ImuState(
+            se3.retract(imu.T_imu_ref, step(f"T_imu {j}")), imu.dt + float(step(f"dt_imu {j}")[0]), imu.bias + core[:, biases(j)], models[j]
+        )
+        for j, imu in enumerate(x.beside, 1)
     )
     return JointState(
         R=so3.project(x.R @ so3.exp(core[:, ROTATION])),
         p=x.p + core[:, POSITION],
-        bias=x.bias + core[:, BIASES],
+        bias=x.bias + core[:, biases(0)],
         cameras=cameras,
         gravity=x.gravity + step("gravity"),
-        board_scale=x.board_scale + float(moved.get(SCALE, _NO_3)[0]),
-        imu=imu,
+        board_scale=x.board_scale + (float(step(SCALE)[0]) if SCALE in where.extras else 0.0),
+        imu=models[0],
+        beside=beside,
+    )
+
+
+def _moved(model: ImuModel, steps: dict[str, Array]) -> ImuModel:
+    return replace(
+        model,
+        M_a=model.M_a + lower(steps.get(M_A, _NO_6)),
+        M_g=model.M_g + lower(steps.get(M_G, _NO_6)),
+        C_g_i=model.C_g_i @ so3.exp(steps.get(PHI, _NO_3)),
+        A_g=model.A_g + steps.get(A_G, _NO_9).reshape(3, 3),
     )
 
 

@@ -10,7 +10,7 @@ from calibkit.estimation.diagnosis import Evidence, Suspect
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import DRAWS, draw, schur
 from calibkit.estimation.joint_problem import Drift, JointProblem
-from calibkit.estimation.joint_state import DRIFTING, LINE, M_A, M_G, PHI, SCALE, CameraState, JointState, model_step
+from calibkit.estimation.joint_state import DRIFTING, LINE, M_A, M_G, PHI, SCALE, CameraState, JointState, model_step, of_imu
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -112,13 +112,16 @@ def with_trajectory(problem: JointProblem, x: JointState) -> JointState:
 
 def left_by_sensor(problem: JointProblem, x: JointState) -> dict[str, tuple[Array, Array]]:
     """Return the times (n,) s and residuals (n, d) of what counts: "camera 0" ... px, "gyro" rad/s, "accel" m/s^2."""
-    left, imu = problem.imu_residuals(x), problem.imu
     out = {}
     for c, (frames, camera) in enumerate(zip(problem.cameras, x.cameras, strict=True)):
         px, valid = corner_residuals(problem, x, c)
         frame, corner = np.nonzero((frames.views.weight > 0) & valid)
         out[f"camera {c}"] = frames.t[frame] + camera.dt, px[frame, corner]
-    return out | {kind: (imu.t[imu.keep[:, k]], left[imu.keep[:, k], 3 * k : 3 * k + 3]) for k, kind in enumerate(("gyro", "accel"))}
+    for j, (rows, imu) in enumerate(zip(problem.imus, x.imus, strict=True)):
+        left, t = problem.imu_residuals(x, j), rows.t + imu.dt
+        parts = {of_imu(kind, j): (rows.keep[:, k], slice(3 * k, 3 * k + 3)) for k, kind in enumerate(("gyro", "accel"))}
+        out |= {kind: (t[kept], left[kept, part]) for kind, (kept, part) in parts.items()}
+    return out
 
 
 def rms_by_sensor(problem: JointProblem, x: JointState) -> dict[str, float]:

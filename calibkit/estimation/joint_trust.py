@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 from calibkit.estimation.joint_fit import JointFit, corner_residuals
 from calibkit.estimation.joint_noise import schur
 from calibkit.estimation.joint_parts import projected
-from calibkit.estimation.joint_state import A_G, DRIFTING, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE
+from calibkit.estimation.joint_state import A_G, DRIFTING, LINE, LINE_SCALE, M_A, M_G, PHI, SCALE, of_imu
 from calibkit.estimation.lens_fit import rows_of
 from calibkit.estimation.lens_trust import biased, lens_scales
 from calibkit.estimation.open_directions import TRANSFORM_SCALES
@@ -125,6 +125,10 @@ def border_scales(fit: JointFit) -> Array:
     scales[border["gravity"]] = _GRAVITY_SCALE
     for name in set(fit.problem.extras) - {LINE}:
         scales[border[name]] = EXTRA_SCALES[name]
+    for j, beside in enumerate(fit.problem.beside, 1):
+        scales[border[f"T_imu {j}"]], scales[border[f"dt_imu {j}"]] = TRANSFORM_SCALES, SCALES["s"]
+        for name in beside.extras:
+            scales[border[of_imu(name, j)]] = EXTRA_SCALES[name]
     for c, (frames, camera) in enumerate(zip(fit.problem.cameras, fit.x.cameras, strict=True)):
         scales[border[f"T {c}"]] = TRANSFORM_SCALES
         scales[border[f"dt {c}"]] = SCALES["s"]

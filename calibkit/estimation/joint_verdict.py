@@ -12,9 +12,9 @@ from calibkit.estimation.joint_causes import jittering, wrong_sensors
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_frozen import WORDS
 from calibkit.estimation.joint_gaps import gaps_of_camera, gaps_of_imu, never_together
-from calibkit.estimation.joint_imu import ImuInput
+from calibkit.estimation.joint_imu import NamedImu
 from calibkit.estimation.joint_rivals import Rival
-from calibkit.estimation.joint_state import A_G, IMU_MODEL, LINE, M_A, M_G, PHI
+from calibkit.estimation.joint_state import A_G, IMU_MODEL, LINE, M_A, M_G, PHI, of_imu
 from calibkit.estimation.joint_trust import Trust
 from calibkit.estimation.open_directions import Open, open_directions
 from calibkit.estimation.stamps import StampReport
@@ -28,6 +28,7 @@ _GRAVITY_OFF = 4.0  # sigmas of what was told
 _SCALE_OFF, _SURE = 0.004, 5.0  # of the board's size, and sigmas
 _HALVES_APART = 4.5  # sigmas; over some 14 numbers by chance once in ten thousand recordings
 _MOTION = "turn the rig back and forth about two or more axes and move it, with the board in view, for 30 s or more"
+_TURN = "turn the rig fast, back and forth about two or more axes"
 _OTHER_CLOCK_S = 1.0
 _READOUT_S = 5e-4  # of an image: less costs 0.25 px at the first and the last row at a fast 1 rad/s
 _ODD_SCALE = 1.25  # a scale farther from 1 is no sensor's error
@@ -45,6 +46,7 @@ class Judged:
 
     statuses: tuple[Status, ...]  # (p,)
     opens: tuple[tuple[Open, ...], ...]  # per camera, of T_cam_imu
+    opens_of_imus: tuple[tuple[Open, ...], ...]  # per further IMU, of T_imu_ref
     reasons: dict[str, tuple[Reason, ...]]  # by rig entry, "" what concerns all
 
     @property
@@ -59,16 +61,16 @@ class Judged:
 
 
 def judge_joint(
-    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imu: str, of_imu: ImuInput, stamps: dict[str, StampReport]
+    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imus: Sequence[NamedImu], stamps: dict[str, StampReport]
 ) -> Judged:
-    """Return what is known of the cameras and of `imu`."""
-    fit, names = joint.fit, tuple(each.views.camera for each in cameras)
+    """Return what is known of the cameras and of the IMUs."""
+    fit, names, imu = joint.fit, tuple(each.views.camera for each in cameras), imus[0].name
     border = fit.problem.border
     sigma = np.sqrt(np.diag(trust.cov)) / trust.scales
     statuses = [Status(grade(s)) for s in sigma]
     jitter = [jittering(joint, c, name, stamps) for c, name in enumerate(names)]
     reasons: dict[str, tuple[Reason, ...]] = {"": ()}
-    opens = []
+    opens, opens_of_imus = [], []
     for c, name in enumerate(names):
         T, dt = f"T_{name}_{imu}", f"dt_{imu}_{name}"
         where = border[f"T {c}"]
@@ -76,28 +78,32 @@ def judge_joint(
         opens.append(found)
         reasons[T] = tuple(Reason(_VERDICTS[Status(each.grade)], f"{T}: {_open_text(each)}") for each in found)
         k = border[f"dt {c}"].start
-        size = f"its sigma would be {sigma[k] * trust.scales[k] * 1e3:.2g} ms"
-        known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[statuses[k]]
-        reasons[dt] = (Reason(_VERDICTS[statuses[k]], f"{dt}: {known}; {_MOTION}"),) if known else ()
+        reasons[dt] = _of_known_offset(dt, statuses[k], float(sigma[k] * trust.scales[k]), _MOTION)
         if joint.rival is not None:
             reasons[dt] = (_of_rival(dt, fit.x.cameras[c].dt, joint.rival, c),)
         rolls = _of_shutter(joint, checks, name, c)
         judged = judge_time_offset(dt, name, imu, joint.turns[c], {s: stamps[s] for s in (name, imu) if s in stamps})
         if statuses[k] is not Status.NOT_OBSERVABLE:
             turns = () if rolls or fit.x.cameras[c].line_delay else judged.turns  # which know nothing of a shutter
-            reasons[dt] += (*_of_offset(joint, c, dt, name, imu), *judged.clock, *turns, *judged.stamps)
+            reasons[dt] += (*_of_offset(fit.x.cameras[c].dt, dt, name, imu), *judged.clock, *turns, *judged.stamps)
         cause = jitter[c]  # what follows from it, or from a shutter, is not told
         corners = rolls or (_of_corners(joint, names, c) if cause is None else (cause,))
         reasons[name] = (*_of_lens(joint, trust, cameras[c], c), *corners, *gaps_of_camera(joint, c, name))
         if cause is not None:
             reasons[dt] = tuple(reason for reason in reasons[dt] if "jitter" not in reason.text)
-    reasons[imu] = _of_imu(joint, statuses, imu, of_imu)
+    for j, each in enumerate(imus):
+        reasons[each.name] = (*_of_imu(joint, statuses, each, j), *(gaps_of_imu(joint, each.name, j) if j else ()))
+        if j:
+            found, more = _of_beside(joint, trust, statuses, (each.name, imu), j, stamps)
+            opens_of_imus.append(found)
+            reasons |= more
+    sensors = (*names, *(each.name for each in imus))
     wrong = _contradicting(joint, statuses, names, imu)
     if wrong:  # what they leave open is no lack of motion
-        reasons |= {key: _follows(key, each) for key, each in reasons.items() if key not in (*names, imu)}
-    reasons[""] = _of_all(joint, checks, imu, any(cause is not None for cause in jitter), wrong)
-    reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, (*names, imu)))}
-    return Judged(tuple(statuses), tuple(opens), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
+        reasons |= {key: _follows(key, each) for key, each in reasons.items() if key not in sensors}
+    reasons[""] = _of_all(joint, checks, sensors[len(names) :], any(cause is not None for cause in jitter), wrong)
+    reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, sensors))}
+    return Judged(tuple(statuses), tuple(opens), tuple(opens_of_imus), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
 
 
 def _contradicting(joint: Joint, statuses: Sequence[Status], names: tuple[str, ...], imu: str) -> list[str]:
@@ -119,9 +125,30 @@ def _rank(key: str, names: tuple[str, ...]) -> int:
     return 0 if not key else 1 if key in names else 2
 
 
-def _of_offset(joint: Joint, c: int, dt: str, name: str, imu: str) -> tuple[Reason, ...]:
+def _of_known_offset(dt: str, status: Status, sigma: float, mend: str) -> tuple[Reason, ...]:
+    size = f"its sigma would be {sigma * 1e3:.2g} ms"
+    known = {Status.DETERMINED: "", Status.WEAK: f"weak: {size}", Status.NOT_OBSERVABLE: f"not observable: {size}"}[status]
+    return (Reason(_VERDICTS[status], f"{dt}: {known}; {mend}"),) if known else ()
+
+
+def _of_beside(
+    joint: Joint, trust: Trust, statuses: Sequence[Status], names: tuple[str, str], j: int, stamps: dict[str, StampReport]
+) -> tuple[tuple[Open, ...], dict[str, tuple[Reason, ...]]]:
+    """Return what is open of where IMU j sits beside the first one, and what there is to say of that and of its clock."""
+    name, ref = names
+    T, dt, border = f"T_{name}_{ref}", f"dt_{ref}_{name}", joint.fit.problem.border
+    where, k = border[f"T_imu {j}"], border[f"dt_imu {j}"].start
+    found = open_directions(T, ref, np.eye(3), trust.cov[where, where])
+    of_dt = _of_known_offset(dt, statuses[k], float(np.sqrt(trust.cov[k, k])), _TURN)
+    if not of_dt or statuses[k] is Status.WEAK:
+        judged = judge_time_offset(dt, name, ref, joint.turns_of_imus[j - 1], {s: stamps[s] for s in names if s in stamps})
+        of_dt += (*_of_offset(joint.fit.x.beside[j - 1].dt, dt, name, ref), *judged.clock, *judged.stamps)
+    of_T = tuple(Reason(_VERDICTS[Status(each.grade)], f"{T}: {_open_text(each, _TURN)}") for each in found)
+    return found, {T: of_T, dt: of_dt}
+
+
+def _of_offset(size: float, dt: str, name: str, imu: str) -> tuple[Reason, ...]:
     found = []
-    size = joint.fit.x.cameras[c].dt
     if abs(size) > _OTHER_CLOCK_S:
         text = f"{dt}: {size:.3f} s is more than any delay: {name} and {imu} have clocks of different origins"
         found.append(Reason(Verdict.CHECK, f"{text}: it will be another one at the next start"))
@@ -135,31 +162,31 @@ def _of_rival(dt: str, one: float, rival: Rival, c: int) -> Reason:
     return Reason(Verdict.FAIL, f"{dt}: not observable: {both}: {why}; turn irregularly, about several axes")
 
 
-def _open_text(each: Open) -> str:
+def _open_text(each: Open, turn: str = "accelerate along several axes") -> str:
     cause = "not observable in this motion" if each.grade == "not observable" else f"weak ({each.sigma:.0f} times 1 mm, 1 mrad)"
-    mend = "accelerate along several axes" if each.text.startswith("R") else "turn about axes across it, 30 deg or more each way"
+    mend = turn if each.text.startswith("R") else "turn about axes across it, 30 deg or more each way"
     return f"{each.text} is {cause}: {mend}"
 
 
-def _of_imu(joint: Joint, statuses: Sequence[Status], imu: str, known: ImuInput) -> tuple[Reason, ...]:
-    """Return what is not known of the IMU's model, and a scale that is another unit's."""
-    border, found = joint.fit.problem.border, []
-    if known.given:
+def _of_imu(joint: Joint, statuses: Sequence[Status], each: NamedImu, j: int) -> tuple[Reason, ...]:
+    """Return what is not known of IMU j's model, and a scale that is another unit's."""
+    imu, border, found = each.name, joint.fit.problem.border, []
+    if each.input.given:
         text = f"{imu}: its scale and axes are held as given without a covariance: the sigmas of T and dt hold none of their errors"
         found.append(Reason(Verdict.CHECK, text))
     for status in (Status.NOT_OBSERVABLE, Status.WEAK):
         for extra, mend in _IMU_MENDS.items():
-            if extra not in border.extras:
+            if extra not in border.free_of(j):
                 continue
-            where = border[extra]
+            where = border[of_imu(extra, j)]
             those = [key for key, s in zip(IMU_MODEL[extra], statuses[where], strict=True) if s is status]
             if those:
                 be = "is" if len(those) == 1 else "are"
                 found.append(Reason(_VERDICTS[status], f"{imu}: {', '.join(those)} {be} {status.value}: {mend}"))
-    model = joint.fit.x.imu
+    model = joint.fit.x.imus[j].model
     for extra, M in ((M_A, model.M_a), (M_G, model.M_g)):
         scale = float(np.median(np.diag(M)))
-        if extra in border.extras and not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+        if extra in border.free_of(j) and not 1 / _ODD_SCALE < scale < _ODD_SCALE:
             sensor = WORDS["accel" if extra == M_A else "gyro"]
             found.append(Reason(Verdict.FAIL, f"{imu}: the {sensor}'s scale is {scale:.4g}, not about 1: another unit, or raw counts?"))
     return tuple(found)
@@ -220,19 +247,21 @@ def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, .
     return tuple(found)
 
 
-def _of_all(joint: Joint, checks: Checks, imu: str, jitter: bool, wrong: list[str]) -> tuple[Reason, ...]:
-    fit = joint.fit
+def _of_all(joint: Joint, checks: Checks, imus: tuple[str, ...], jitter: bool, wrong: list[str]) -> tuple[Reason, ...]:
+    fit, imu = joint.fit, imus[0]
     found = []
     if not fit.converged:
         found.append(Reason(Verdict.FAIL, "the fit did not settle: cameras and IMU do not fit together, or the motion tells too little"))
     if wrong:
         found = [Reason(Verdict.FAIL, text) for text in wrong]
     else:
-        found += [reason for i, kind in enumerate(WORDS) if not jitter for reason in _of_samples(joint, i, kind, imu)]
+        asked = [(i, kind, name, j) for j, name in enumerate(imus) for i, kind in enumerate(WORDS) if j or not jitter]
+        found += [reason for each in asked for reason in _of_samples(joint, *each)]
         found += _of_scale(joint, checks, imu)
     found += gaps_of_imu(joint, imu)
-    if not np.all(joint.walks_told):
-        text = f"{imu} has no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
+    if untold := [name for name, told in zip(imus, joint.imus, strict=True) if not np.all(told.walks)]:
+        have = f"{' and '.join(untold)} {'has' if len(untold) == 1 else 'have'}"
+        text = f"{have} no random walks in the rig file, a consumer IMU's were taken: run calibkit allan on an hour at rest, add --rig"
         found.append(Reason(Verdict.CHECK, text))
     if checks.halves is not None and (apart := float(np.max(np.abs(checks.halves.z)))) > _HALVES_APART:
         text = f"the two halves of the recording disagree by {apart:.1f} sigma"
@@ -264,14 +293,14 @@ def _of_scale(joint: Joint, checks: Checks, imu: str) -> list[Reason]:
     return found
 
 
-def _of_samples(joint: Joint, i: int, kind: str, imu: str) -> list[Reason]:
+def _of_samples(joint: Joint, i: int, kind: str, imu: str, j: int) -> list[Reason]:
     found = []
-    factor, (check, fail) = joint.fit.factors[kind], _NOISIER[kind]
+    factor, (check, fail) = joint.fit.factors[of_imu(kind, j)], _NOISIER[kind]
     if factor > check:
-        than = "its noise density says" if joint.densities_told[i] else "its samples scatter from one to the next"
+        than = "its noise density says" if joint.imus[j].densities[i] else "its samples scatter from one to the next"
         text = f"{imu}'s {WORDS[kind]} is {factor:.1f} times noisier than {than}: vibration, a wrong unit or density?"
         found.append(Reason(Verdict.FAIL if factor > fail else Verdict.CHECK, text))
-    lost = 1 - float(np.mean(joint.fit.problem.imu.keep[:, i]))
+    lost = 1 - float(np.mean(joint.fit.problem.imus[j].keep[:, i]))
     if lost > _LOST:
         verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK
         text = f"{100 * lost:.0f} % of the samples of {imu}'s {WORDS[kind]} fit no smooth motion: shocks, or wrong samples"

@@ -14,7 +14,7 @@ from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.models.imu import STANDARD_GRAVITY, Gravity
 from calibkit.report.summary import Summary
-from calibkit.stages.camera_imu import name_imu
+from calibkit.stages.camera_imu import name_imus
 from calibkit.stages.intrinsics import AUTO, intrinsics, name_cameras
 from calibkit.stages.intrinsics import Options as LensOptions
 from calibkit.stages.joint import Options as JointOptions
@@ -34,7 +34,7 @@ class Options:
 
     cameras: tuple[str, ...] = ()  # topics, or NAME=/topic
     models: tuple[str, ...] = (AUTO,)  # one for all cameras, or one each
-    imu: str | None = None  # topic, or NAME=/topic
+    imus: tuple[str, ...] = ()  # topics, or NAME=/topic
     reading: ImuOptions = _DEFAULT
     gravity: Gravity = STANDARD_GRAVITY
     resolution: tuple[int, int] | None = None  # of corner files, which do not say it
@@ -109,14 +109,17 @@ def _plan(sources: Sequence[Path], target: Path, recording: Recording, base: Rig
     else:
         lens = LensOptions(cameras, options.models, options.resolution, ros_distro=options.ros_distro)
         steps.append(Step("intrinsics", lambda out, progress: intrinsics(sources, target, out, lens, progress)))
-    if options.imu is None and not any(topic.kind == "imu" for topic in recording.topics):
+    if not options.imus and not any(topic.kind == "imu" for topic in recording.topics):
         notes.append("timeoffset and joint were not run: the recording has no IMU")
         return steps, notes
-    name, imu = name_imu(recording, base, options.imu)
+    imus = name_imus(recording, base, options.imus)
+    name, imu = next(iter(imus.items()))
     for camera, topic in topics.items():
         pair = OffsetOptions(camera, name, (f"{camera}={topic}", f"{name}={imu}"), target, options.reading, ros_distro=options.ros_distro)
         steps.append(Step("timeoffset", partial(_offset, sources, pair)))
-    both = JointOptions(cameras, f"{name}={imu}", options.reading, options.gravity, ros_distro=options.ros_distro)
+    both = JointOptions(
+        cameras, tuple(f"{name}={imu}" for name, imu in imus.items()), options.reading, options.gravity, ros_distro=options.ros_distro
+    )
     steps.append(Step("joint", lambda out, progress: joint(sources, target, out, both, progress)))
     return steps, notes
 

@@ -11,7 +11,7 @@ from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.progress import Progress
 from calibkit.data.rig import Camera, Imu, Rig
 from calibkit.errors import BadInputError, one_line
-from calibkit.estimation.joint import CameraInput, ImuNoise, Joint, Settings, calibrate_joint
+from calibkit.estimation.joint import BesideInput, CameraInput, ImuNoise, Joint, Settings, calibrate_joint
 from calibkit.estimation.joint_imu import ImuInput, imu_input
 from calibkit.estimation.joint_problem import GravityPrior
 from calibkit.estimation.stamps import StampReport, check_stamps
@@ -25,7 +25,6 @@ from calibkit.stages.intrinsics import name_cameras, observe
 
 _DEFAULT = ImuOptions()
 _IN_G = (0.7, 1.4)  # median |a|
-_IMU_NAME = "imu0"
 _GRAVITY_SIGMA = 1e-4  # m/s^2; a |g| that was given is no better known, tides alone move it by 1e-6 of it
 
 
@@ -34,11 +33,21 @@ class Sensors:
     """Which sensors, and how to read them."""
 
     cameras: tuple[str, ...] = ()  # topics, or NAME=/topic
-    imu: str | None = None  # topic, or NAME=/topic
+    imus: tuple[str, ...] = ()  # topics, or NAME=/topic; the first is the one that the others are beside
     reading: ImuOptions = _DEFAULT
     gravity: Gravity = STANDARD_GRAVITY
     cache: bool = True
     ros_distro: str | None = None
+
+
+@dataclass(frozen=True)
+class ImuRead:
+    """One IMU: what was read, and what the rig file says of it."""
+
+    name: str
+    topic: str
+    known: Imu
+    input: ImuInput
 
 
 @dataclass(frozen=True)
@@ -49,10 +58,7 @@ class CameraImu:
     board: Board
     views: tuple[BoardViews, ...]
     lenses: tuple[Camera, ...]  # in the order of views
-    imu_name: str
-    imu_topic: str
-    known_imu: Imu
-    imu: ImuInput
+    imus: tuple[ImuRead, ...]
     gravity: GravityPrior
     inputs: tuple[tuple[str, str | None], ...]
 
@@ -61,9 +67,13 @@ class CameraImu:
         return tuple(each.camera for each in self.views)
 
     @property
+    def imu(self) -> ImuRead:
+        return self.imus[0]
+
+    @property
     def stamps(self) -> dict[str, StampReport]:
-        imu = {self.imu_name: check_stamps(self.imu.samples.t_ns, "sample")}
-        return imu | {each.camera: check_stamps(each.t_ns, "frame") for each in self.views}
+        imus = {each.name: check_stamps(each.input.samples.t_ns, "sample") for each in self.imus}
+        return imus | {each.camera: check_stamps(each.t_ns, "frame") for each in self.views}
 
     @property
     def warnings(self) -> list[str]:
@@ -71,15 +81,20 @@ class CameraImu:
 
     def settings(self, extras: Sequence[str] = (), spacing: float | None = None) -> Settings:
         """Return how to fit, beside what is free of the IMU's model."""
-        return Settings(self.gravity, spacing, self.imu.model, self.imu.information, (*self.imu.extras, *extras))
+        imu = self.imu.input
+        return Settings(self.gravity, spacing, imu.model, imu.information, (*imu.extras, *extras))
 
     def fitted(self, cameras: Sequence[CameraInput], settings: Settings, progress: Progress) -> Joint:
         """Return the joint estimate; BadInputError names the recording and the sensors."""
         try:
-            return calibrate_joint(cameras, self.imu.samples, _noise(self.known_imu), settings, progress)
+            beside = [
+                BesideInput(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras)
+                for each in self.imus[1:]
+            ]
+            return calibrate_joint(cameras, self.imu.input.samples, _noise(self.imu.known), settings, progress, beside)
         except BadInputError as error:
             damaged = "".join(f" ({text})" for text in self.recording.warnings)  # what was not read may be why
-            seen, imu = ", ".join(self.names), self.imu_name
+            seen, imu = ", ".join(self.names), ", ".join(each.name for each in self.imus)
             text = str(error).replace("the first", seen).replace("the second", imu)  # as the time offset calls them
             raise BadInputError(f"{self.recording.name}: {seen} and {imu}: {text}{damaged}") from None
 
@@ -87,25 +102,29 @@ class CameraImu:
 def read_camera_imu(
     sources: Sequence[Path], target: Path, base: Rig, sensors: Sensors, progress: Progress, free: Sequence[str] = ()
 ) -> CameraImu:
-    """Return the corners of all cameras and the IMU's samples; `free` is what the rig file's IMU model is not to tell.
+    """Return the corners of all cameras and the IMUs' samples; `free` is what the rig file's IMU models are not to tell.
 
     BadInputError names the file, topic or option that is wrong.
     """
     board = load_target(target)
     recording = open_recording(list(sources), sensors.ros_distro, sensors.reading)
     topics = name_cameras(recording, _known(base, sensors.cameras))
-    name, topic = name_imu(recording, base, sensors.imu)
+    named = name_imus(recording, base, sensors.imus)
     lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
-    samples = recording.imu(topic, progress)
-    known = base.imus.get(name) or Imu(topic=one_line(topic))
-    imu = imu_input(name, samples, known.intrinsics, free)
-    _refuse_imu(imu.samples, name, topic)
+    imus = tuple(_imu(recording, base, name, topic, free, progress) for name, topic in named.items())
     resolution = next(iter(lenses.values())).resolution
     views = tuple(observe(recording, topics, board, LensOptions(resolution=resolution, cache=sensors.cache), progress))
     gravity = GravityPrior(sensors.gravity.value, max(sensors.gravity.sigma, _GRAVITY_SIGMA))
     inputs = (*recording.inputs(), (target.name, sha256(target.read_bytes()).hexdigest()))
     of_views = tuple(lenses[each.camera] for each in views)
-    return CameraImu(recording, board, views, of_views, name, topic, known, imu, gravity, inputs)
+    return CameraImu(recording, board, views, of_views, imus, gravity, inputs)
+
+
+def _imu(recording: Recording, base: Rig, name: str, topic: str, free: Sequence[str], progress: Progress) -> ImuRead:
+    known = base.imus.get(name) or Imu(topic=one_line(topic))
+    imu = imu_input(name, recording.imu(topic, progress), known.intrinsics, free)
+    _refuse_imu(imu.samples, name, topic)
+    return ImuRead(name, topic, known, imu)
 
 
 def _known(base: Rig, asked: tuple[str, ...]) -> tuple[str, ...]:
@@ -115,12 +134,22 @@ def _known(base: Rig, asked: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{name}={camera.topic}" for name, camera in base.cameras.items() if camera.topic) if len(base.cameras) > 1 else ()
 
 
-def name_imu(recording: Recording, base: Rig, asked: str | None) -> tuple[str, str]:
-    """Return name and topic of the IMU asked for (topic, or NAME=/topic), else of the only one; named as the rig file has its topic."""
-    name, _, topic = (asked or "").rpartition("=")
-    chosen = recording.choose("imu", topic or None)
+def name_imus(recording: Recording, base: Rig, asked: Sequence[str]) -> dict[str, str]:
+    """Return the topics by name of the IMUs asked for (topic, or NAME=/topic), else of the only one; named as the rig file has the topic.
+
+    BadInputError where two are of one name, or one topic is asked for twice.
+    """
     by_topic = {imu.topic: key for key, imu in base.imus.items() if imu.topic}
-    return name or by_topic.get(chosen, _IMU_NAME), chosen
+    out: dict[str, str] = {}
+    for each in asked or ("",):
+        name, _, topic = each.rpartition("=")
+        chosen = recording.choose("imu", topic or None)
+        name = name or by_topic.get(chosen) or f"imu{len(out)}"
+        if name in out or chosen in out.values():
+            which = f"of the name {one_line(name)}" if name in out else f"of the topic {one_line(chosen)}"
+            raise BadInputError(f"two IMUs {which}: give each its own, --imu imu0=/a --imu imu1=/b")
+        out[name] = chosen
+    return out
 
 
 def _lens(base: Rig, name: str, topic: str) -> Camera:

@@ -157,7 +157,7 @@ def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | 
     options = options or Options()
     temperature = None if options.temperature is None else load_temperature(options.temperature)
     read = read_camera_imu(sources, target, rig, options, progress)
-    known = known_calibration(rig, read.names, read.imu_name, read.imu.model)
+    known = known_calibration(rig, read.names, read.imu.name, read.imu.input.model)
     cameras = [CameraInput(views, lens) for views, lens in zip(read.views, read.lenses, strict=True)]
     joint = read.fitted(cameras, read.settings(), progress)
     if not joint.fit.converged:
@@ -173,7 +173,7 @@ def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | 
     rms = _rms(rms_by_sensor(problem, held), rms_by_sensor(problem, x), read)
     about = About(
         read.names,
-        read.imu_name,
+        read.imu.name,
         tuple(CAMERAS[lens.model] for lens in read.lenses),
         tuple(camera.lens for camera in x.cameras),
         tuple(frames.views.uv[frames.views.weight > 0] for frames in problem.cameras),
@@ -220,13 +220,13 @@ def _rms(held: dict[str, float], best: dict[str, float], read: CameraImu) -> tup
 def sensors_of(read: CameraImu) -> dict[str, tuple[str, str]]:
     """Return what each kind of residual is called, and its unit."""
     names = {f"camera {c}": (f"{name}'s corners", "px") for c, name in enumerate(read.names)}
-    return names | {"gyro": (f"{read.imu_name}'s gyroscope", "rad/s"), "accel": (f"{read.imu_name}'s accelerometer", "m/s^2")}
+    return names | {"gyro": (f"{read.imu.name}'s gyroscope", "rad/s"), "accel": (f"{read.imu.name}'s accelerometer", "m/s^2")}
 
 
 def _what(joint: Joint, read: CameraImu) -> str:
     corners = sum(int((frames.views.weight > 0).sum()) for frames in joint.fit.problem.cameras)
     span = joint.fit.problem.imu.t[-1] - joint.fit.problem.imu.t[0]
-    return f"{', '.join(read.names)} and {read.imu_name}: {corners} corners, {len(joint.fit.problem.imu.t)} samples over {span:.4g} s"
+    return f"{', '.join(read.names)} and {read.imu.name}: {corners} corners, {len(joint.fit.problem.imu.t)} samples over {span:.4g} s"
 
 
 def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ...]:
@@ -237,13 +237,13 @@ def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ..
         if lens.reprojection is not None and lens.reprojection.rms_px > 0 and (factor := now / lens.reprojection.rms_px) > _NOISIER:
             text = f"{name}'s corners scatter by {now:.3g} px, {factor:.1f} times what they did at its calibration, whatever the motion"
             found.append(Noise(f"{text}: noise; its R is {now:.2g} px now. Blur, light, or another lens or board?", factor))
-    known = read.known_imu
+    known = read.imu.known
     for kind, density, word in (
         ("gyro", known.gyro_noise_density, "gyroscope"),
         ("accel", known.accel_noise_density, "accelerometer"),
     ):
         if density is not None and density.value and (factor := joint.fit.factors[kind]) > _NOISIER:
             real = factor * density.value
-            text = f"{read.imu_name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
+            text = f"{read.imu.name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
             found.append(Noise(f"{text}: {real:.2e} {density.unit}. Vibration?", factor))
     return tuple(found)

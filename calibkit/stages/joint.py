@@ -14,6 +14,7 @@ from calibkit.data.rig import Camera
 from calibkit.errors import one_line
 from calibkit.estimation.joint import CameraInput
 from calibkit.estimation.joint_checks import check_joint
+from calibkit.estimation.joint_imu import NamedImu
 from calibkit.estimation.joint_result import joint_result
 from calibkit.estimation.joint_state import A_G, LINE, M_A, M_G, PHI
 from calibkit.estimation.joint_trust import joint_trust
@@ -39,7 +40,7 @@ class Options(Sensors):
 def joint(
     sources: Sequence[Path], target: Path, outputs: Outputs | None = None, options: Options | None = None, progress: Progress = silent
 ) -> Saved:
-    """Estimate T_cam_imu, dt_imu_cam and the lenses of a recording of cameras and an IMU before a board.
+    """Estimate T_cam_imu, dt_imu_cam and the lenses of a recording of cameras and IMUs before a board, and how the IMUs lie to each other.
 
     BadInputError names the file, topic or option that is wrong.
     """
@@ -50,13 +51,15 @@ def joint(
     cameras = [_input(each, lens, options.hold_lens) for each, lens in zip(read.views, read.lenses, strict=True)]
     found = read.fitted(cameras, read.settings((LINE,) if options.line_delay else (), options.knots_s), progress)
     trust, checks = joint_trust(found.fit), check_joint(found.fit, options.halves)
-    name, known = read.imu_name, read.known_imu
-    known = known if name in base.imus else known.model_copy(update={"rate_hz": round(found.rate_hz, 3)})
-    result = joint_result(found, trust, checks, cameras, name, read.imu, read.stamps, known)
+    imus = []
+    for each, measured in zip(read.imus, found.imus, strict=True):
+        known = each.known if each.name in base.imus else each.known.model_copy(update={"rate_hz": round(measured.rate_hz, 3)})
+        imus.append(NamedImu(each.name, each.input, known))
+    result = joint_result(found, trust, checks, cameras, imus, read.stamps)
     result = replace(result, facts={**result.facts, "warnings": read.warnings})
     told: dict[str, str | float | int | bool | None] = {
         "target": read.board.key(),
-        "imu": f"{name}={one_line(read.imu_topic)}",
+        "imu": ", ".join(f"{each.name}={one_line(each.topic)}" for each in read.imus),
         "hold_lens": options.hold_lens,
         "imu_model": options.imu_model,
         "g_sensitivity": options.g_sensitivity,

@@ -13,6 +13,7 @@ from calibkit.data.verdict import Reason, Status
 from calibkit.estimation.added_motion import DURATION_S, AddedMotion, missing_motions, worst
 from calibkit.estimation.joint import CameraInput
 from calibkit.estimation.joint_checks import check_joint
+from calibkit.estimation.joint_imu import NamedImu
 from calibkit.estimation.joint_result import joint_result
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.report.columns import columns
@@ -92,13 +93,15 @@ def observability(
     cameras = [CameraInput(views, lens) for views, lens in zip(read.views, read.lenses, strict=True)]
     joint = read.fitted(cameras, read.settings(), progress)
     trust = joint_trust(joint.fit)
-    result = joint_result(joint, trust, check_joint(joint.fit, halves=False), cameras, read.imu_name, read.imu, read.stamps)
+    result = joint_result(
+        joint, trust, check_joint(joint.fit, halves=False), cameras, [NamedImu(read.imu.name, read.imu.input)], read.stamps
+    )
     with threadpool_limits(1, user_api="blas"):
         motions = missing_motions(joint.fit, trust)
     left = tuple(worst(motion.cov, trust.scales, joint.fit) for motion in motions)
     span = joint.fit.problem.imu.t[-1] - joint.fit.problem.imu.t[0]
     frames = ", ".join(f"{len(each.t)} frames of {name}" for each, name in zip(joint.fit.problem.cameras, read.names, strict=True))
-    samples = f"{len(joint.fit.problem.imu.t)} samples of {read.imu_name} over {span:.4g} s"
+    samples = f"{len(joint.fit.problem.imu.t)} samples of {read.imu.name} over {span:.4g} s"
     what = f"{frames}, {samples}; sigmas are those that calibkit joint would have"
     return Observability(what, tuple(_asked(result)), result.reasons, motions, left, tuple(read.warnings))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibkit.data.observations import BoardViews, ImageFrame
 from calibkit.data.progress import silent
-from calibkit.detection import find
+from calibkit.detection import crew, find, sequence
 from calibkit.detection.cache import CornerCache
 from calibkit.detection.find import find_boards
 from calibkit.detection.found import NOTHING, Detection, Tags
@@ -25,6 +25,7 @@ from calibkit.simulation.camera import RenderStyle, SimCamera, place_board
 from calibkit.simulation.render import Renderer
 
 BOARD = AprilGrid(4, 3, 0.088, 0.3)
+UNDER_WAY = 4 * (2 * (crew.os.cpu_count() or 1) + 2)  # images: batches of 4, and the one that is asked for
 CAMERA = SimCamera(CAMERAS["pinhole-radtan"], np.array([300.0, 300, 159.5, 119.5, -0.1, 0.01, 0, 0]), (320, 240))
 
 
@@ -85,7 +86,7 @@ def test_an_odd_size_ends_the_search(images: list[NDArray[np.uint8]]) -> None:
 
     with pytest.raises(BadInputError, match="is 200x100, most others are 320x240"):
         find_boards(many(), BOARD, "cam0", None, silent)
-    assert taken <= 3 + 3 * (find.os.cpu_count() or 1)
+    assert taken <= UNDER_WAY
 
 
 def test_no_images_at_all() -> None:
@@ -113,11 +114,11 @@ def test_few_frames_wait_and_an_interrupt_stops_at_once(images: list[NDArray[np.
                 raise KeyboardInterrupt
             yield item
 
-    monkeypatch.setattr(find, "detect", slow)
+    monkeypatch.setattr(sequence, "detect", slow)
     alive = threading.active_count()
     with pytest.raises(KeyboardInterrupt):
         find_boards(endless(), BOARD, "cam0", None, interrupted)
-    assert taken <= 6 + 3 * (find.os.cpu_count() or 1)
+    assert taken <= 5 + UNDER_WAY
     assert looked <= taken
     assert threading.active_count() == alive
 
@@ -145,7 +146,7 @@ def test_a_layout_that_most_images_contradict_is_refused(
     images: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch, tags: list[Tags], refused: bool, warnings: int
 ) -> None:
     answers = iter(tags)
-    monkeypatch.setattr(find, "detect", lambda image, board: replace(NOTHING, tags=next(answers)))
+    monkeypatch.setattr(sequence, "detect", lambda image, board: replace(NOTHING, tags=next(answers)))
     asked = frames(images[:3])
     if refused:
         with pytest.raises(BadInputError, match=r"80% of the tags found \(72 of 90\) .* check its tagCols"):

@@ -30,14 +30,14 @@ def code(tag: int) -> Gray:
     return bits[:, ::-1]
 
 
-def _normalised(cells: Array) -> Array:
+def _normalised(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     cells = cells - cells.mean(-1, keepdims=True)
-    out: Array = cells / np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-9)
+    out: NDArray[np.float32] = cells / np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
     return out
 
 
-def _templates() -> Array:
-    codes = np.stack([code(tag) for tag in range(N_TAGS)]).astype(float)
+def _templates() -> NDArray[np.float32]:
+    codes = np.stack([code(tag) for tag in range(N_TAGS)]).astype(np.float32)
     turned = [np.rot90(codes, turn, axes=(1, 2)) for turn in range(4)]
     return _normalised(np.stack(turned, axis=1).reshape(-1, _BITS**2))  # row 4 * tag + turn
 

@@ -26,6 +26,8 @@ _REACH = 1.0  # tag sides over which neighbours tell how a lens bends
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
 _STARTS = 8  # seeds whose homographies are tried: enough that some are right
+_RIM = 0.1  # tag sides out of view that are tried once more: where the first try found two corners, the others are known better
+_KEPT = 0.7  # of the tags foretold, where a board is followed
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
 
 
@@ -36,21 +38,54 @@ def detect(image: Image, board: AprilGrid) -> Detection:
         raise BadInputError(
             f"an AprilGrid of {board.columns} x {board.rows} needs {n} tags, the family 36h11 has {april_tags.N_TAGS}: use fewer"
         )
-    xy = (board.points[:, :2] / board.tag_size).reshape(-1, 4, 2)
     smoothed = smooth(image)
     read = Tags()
     for tags, corners in april_tags.seeds(to_8_bit(image)):
-        seed, seen = _read(smoothed, tags, corners)
-        foreign = int(seen[n:].sum())
-        seed, seen = seed[:n], seen[:n]
-        uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed, seen)
-        known = fitted.any(1)
-        if known.sum() >= 2:
-            counts = Tags(int(seen.sum()), int((seen & ~known).sum()), foreign)
-            return replace(_finish(smoothed, xy, board.spacing, uv, fitted), tags=counts)
-        counts = Tags(int(seen.sum()), max(int(seen.sum()) - 1, 0), foreign)  # no two agree; a lone one contradicts nothing
-        read = max(read, counts, key=lambda tags: tags.on_board + tags.foreign)
+        found = _from_seeds(smoothed, board, tags, corners)
+        if len(found.corner):
+            return found
+        read = max(read, found.tags, key=lambda tags: tags.on_board + tags.foreign)
     return replace(NOTHING, tags=read)
+
+
+def follow(image: Image, board: AprilGrid, corner: NDArray[np.int32], uv: Array) -> Detection | None:
+    """Return what `detect` would, from where corners (n,) are thought to be (n, 2); None where too few of their tags are."""
+    tags, first, count = np.unique(corner // 4, return_index=True, return_counts=True)
+    corners = uv[first[count == 4, None] + np.arange(4)]
+    in_view = _inside(image, corners).all(1)
+    tags, corners = tags[count == 4][in_view], corners[in_view]
+    if len(tags) < 2:
+        return None
+    smoothed = smooth(image)
+    xy = _tags(board)
+    seed, seen = _read(smoothed, tags, corners)
+    if seen.sum() < max(2, _KEPT * len(tags)):
+        return None
+    uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed[: len(xy)], np.flatnonzero(seen))
+    return replace(_finish(smoothed, xy, board.spacing, uv, fitted), tags=Tags(int(seen.sum())))
+
+
+def _from_seeds(image: Smoothed, board: AprilGrid, tags: NDArray[np.int32], corners: Array) -> Detection:
+    xy = _tags(board)
+    seed, seen = _read(image, tags, corners)
+    foreign = int(seen[len(xy) :].sum())
+    seed, seen = seed[: len(xy)], seen[: len(xy)]
+    first = np.flatnonzero(seen)
+    if len(first) >= 2:
+        first = first[_largest_agreement(xy[first], seed[first])]
+    uv, fitted = _grow(image, xy, 1 + board.spacing, seed, first)
+    known = fitted.any(1)
+    if known.sum() >= 2:
+        counts = Tags(int(seen.sum()), int((seen & ~known).sum()), foreign)
+        return replace(_finish(image, xy, board.spacing, uv, fitted), tags=counts)
+    counts = Tags(int(seen.sum()), max(int(seen.sum()) - 1, 0), foreign)  # no two agree; a lone one contradicts nothing
+    return replace(NOTHING, tags=counts)
+
+
+def _tags(board: AprilGrid) -> Array:
+    """Return the tags' corners (t, 4, 2) in tag sides."""
+    out: Array = (board.points[:, :2] / board.tag_size).reshape(-1, 4, 2)
+    return out
 
 
 def _read(image: Smoothed, tags: NDArray[np.int32], corners: Array) -> tuple[Array, Mask]:
@@ -101,19 +136,16 @@ def _fit(image: Smoothed, corners: Array, window: float) -> tuple[Array, Mask]:
     return np.where(ok[..., None], moved, corners), ok
 
 
-def _inside(image: Smoothed, corners: Array) -> Mask:
+def _inside(image: Image | Smoothed, corners: Array) -> Mask:
     return np.asarray(((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1))
 
 
-def _grow(image: Smoothed, xy: Array, step: float, seed: Array, seen: Mask) -> tuple[Array, Mask]:
-    """Return the corners uv (t, 4, 2) of all tags that the largest agreement of seeds leads to, and which (t, 4) were fitted.
+def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[np.intp]) -> tuple[Array, Mask]:
+    """Return the corners uv (t, 4, 2) of all tags that the seeds of the `first` (k,) lead to, and which (t, 4) were fitted.
 
     Each tag next to known ones starts from its seed where that is near the place foretold, else from there.
     """
     uv, fitted = np.zeros_like(xy), np.zeros(xy.shape[:2], bool)
-    first = np.flatnonzero(seen)
-    if len(first) >= 2:
-        first = first[_largest_agreement(xy[first], seed[first])]
     uv[first], fitted[first] = seed[first], True
     centre = xy.mean(1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
@@ -147,12 +179,13 @@ def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed:
     m = len(ask)
     out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool))
     todo = np.arange(m)
-    for window in (_NARROW, _NARROW, _WIDE):
+    for window, beyond in ((_NARROW, _AGREE), (_NARROW, _RIM), (_WIDE, _RIM)):
         start = predict(xy[fitted], uv[fitted], xy[ask[todo]], step)
         seeds, slack = seed[ask[todo]], _AGREE * _sides(start)
         near = np.linalg.norm(seeds - start, axis=-1).max(1) < slack  # NaN is not
         start = np.where(near[:, None, None], seeds, start)
-        in_view = ((start > -slack[:, None, None]) & (start < image.shape[::-1] + slack[:, None, None])).all((1, 2))
+        outside = np.maximum(-start, start - image.shape[::-1]).max((1, 2))
+        in_view = outside < beyond * _sides(start)
         todo, start = todo[in_view], start[in_view]
         if not len(todo):
             break

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import platformdirs
 
-from calibkit.detection.found import Detection, Tags
+from calibkit.detection.found import Detection, Entry, Tags
 from calibkit.models.board import Board
 from calibkit.opencv import cv2
 from calibkit.version import __version__
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from importlib.abc import Traversable
 
 T = TypeVar("T")
-Entry = tuple[tuple[int, int], Detection]  # image width and height, what was found
 
 _HEADER = struct.Struct("<4s6I")
 _MAGIC = b"ckc2"

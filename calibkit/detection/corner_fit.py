@@ -7,7 +7,7 @@ no model of blur or contrast, and its residual is the honest noise. (Saddle: Luc
 Duda & Frese 2018 build on.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ _BLUR_PX2 = SMOOTHING_PX**2 + 0.35  # with what optics and pixels usually add
 FLOOR_PX = 0.005  # sampling error that stays without any noise
 _KERNEL = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
 _MUCH_WORSE = 12.0  # than the frame's typical sigma: something else is in the window
+_STILL_PX = 0.03  # a longer last step: there the derivatives are not those of the place where it began
 _MAX_WINDOW_PX = 8.0  # samples of wider windows would lie too far apart for the smoothing
 _MIN_WINDOW_PX = 2.0
 _SHRINK = 0.5  # of a saddle window wider than that, each iteration
@@ -35,22 +36,30 @@ def smooth(image: Image) -> Smoothed:
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
 
 
-def sample(image: Smoothed, uv: Array) -> Array:
+def sample(image: Smoothed, uv: Array) -> Smoothed:
     """Return the image's values (...) at pixels (..., 2), bilinear, the border repeated.
 
     Not cv2.remap: that one rounds to 1/32 px.
     """
+    return _at(image, uv[..., 0], uv[..., 1])
+
+
+def _at(image: Smoothed, u: Array, v: Array) -> Smoothed:
     h, w = image.shape
-    x, y = (np.minimum(np.maximum(uv[..., axis], 0), size - 1.001) for axis, size in enumerate((w, h)))
+    x, y = np.minimum(np.maximum(u, 0), w - 1.001), np.minimum(np.maximum(v, 0), h - 1.001)
     column, row = x.astype(np.intp), y.astype(np.intp)
     x -= column
     y -= row
-    k = row * w + column
+    right, down = x.astype(np.float32), y.astype(np.float32)
+    row *= w
+    row += column
     flat = image.ravel()
-    top, bottom = flat.take(k), flat.take(k + w)
-    top = top + x * (flat.take(k + 1) - top)
-    bottom = bottom + x * (flat.take(k + (w + 1)) - bottom)
-    out: Array = top + y * (bottom - top)
+    top, bottom = flat.take(row), flat.take(row + w)
+    row += 1
+    top += right * (flat.take(row) - top)
+    row += w
+    bottom += right * (flat.take(row) - bottom)
+    out: Smoothed = top + down * (bottom - top)
     return out
 
 
@@ -68,6 +77,7 @@ def _disc(n: int) -> Array:
 
 _WINDOW = _disc(9)
 _HALF = _WINDOW[(_WINDOW[:, 1] > 1e-9) | ((np.abs(_WINDOW[:, 1]) < 1e-9) & (_WINDOW[:, 0] > 1e-9))]  # one of each pair d, -d
+_SQUARES = np.stack([_HALF[:, 0] ** 2 / 2, _HALF[:, 0] * _HALF[:, 1], _HALF[:, 1] ** 2 / 2], axis=-1)
 _WEIGHT = np.exp(-0.5 * (_HALF**2).sum(1))  # square root of the pair's weight
 _QUADRATIC = np.linalg.pinv(
     np.stack([np.ones(len(_WINDOW)), *_WINDOW.T, _WINDOW[:, 0] ** 2, _WINDOW[:, 0] * _WINDOW[:, 1], _WINDOW[:, 1] ** 2], axis=1)
@@ -88,8 +98,8 @@ def saddle(image: Smoothed, uv: Array, J: Array, bright: Array | float = 0.0, it
     found = np.ones(len(uv), bool)
     for k in range(iterations):
         window = np.maximum(size * _SHRINK**k, smallest)[:, None, None] * J
-        offsets = _WINDOW @ np.swapaxes(window, 1, 2)
-        _, gx, gy, a, b, c = (sample(image, uv[:, None] + offsets) @ _QUADRATIC.T).T
+        u, v = (uv[:, axis, None] + window[:, axis] @ _WINDOW.T for axis in (0, 1))
+        _, gx, gy, a, b, c = (_at(image, u, v) @ _QUADRATIC.T).T
         det = 4 * a * c - b * b
         found = (det < 0) & (b * bright >= 0)
         det = np.where(found, det, -np.inf)
@@ -118,44 +128,67 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     long, short = _extent(metric)
     room = np.clip(_to_border(image, uv), _MIN_WINDOW_PX, _MAX_WINDOW_PX)
     scale = np.minimum(np.clip(_MIN_WINDOW_PX / short, radius, 1.5 * radius), room / long)
-    odd = scale[:, None, None] * (_HALF @ np.swapaxes(maps.J, 1, 2))
-    squares = np.stack([_HALF[:, 0] ** 2 / 2, _HALF[:, 0] * _HALF[:, 1], _HALF[:, 1] ** 2 / 2], axis=-1)
-    even = scale[:, None, None] ** 2 * (squares @ maps.Q)
+    odd = scale[:, None] * (np.swapaxes(maps.J, 0, 1) @ _HALF.T)
+    even = scale[:, None] ** 2 * (np.moveaxis(maps.Q, 2, 0) @ _SQUARES.T)
+    points = np.concatenate([even + odd, even - odd], axis=2)  # d and then -d of each pair, px from the corners
+    fit = _descend(image, uv, points, None, iterations)
+    far = np.abs(fit.step).max(1) > _STILL_PX
+    if far.any():
+        again = _descend(image, fit.uv[far], points[:, far], fit.light[far], iterations)
+        for field in fields(fit):
+            getattr(fit, field.name)[far] = getattr(again, field.name)
 
-    plus, minus = even + odd, even - odd
-    start, uv = uv, uv.copy()
-    h = np.array([[0.5, 0.0], [0.0, 0.5]])
-    columns, level = [], np.zeros(len(uv))
-    for e in h:
-        at = uv[:, None]
-        a, b = sample(image, at + plus + e), sample(image, at + plus - e)
-        c, d = sample(image, at + minus + e), sample(image, at + minus - e)
-        columns.append((a - b - c + d) * _WEIGHT)
-        level += (a + b + c + d).mean(1)
-    D = np.stack(columns, axis=-1)
-    slope = _light_slope(uv, level)[..., None]
-    light_plus, light_minus = 1 - (plus @ slope)[..., 0], 1 - (minus @ slope)[..., 0]
-    normal = np.swapaxes(D, 1, 2) @ D
-    inverse = np.linalg.inv(normal + np.maximum(1e-9, 1e-6 * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(2))
-    gain = inverse @ np.swapaxes(D, 1, 2)  # (n, 2, pairs)
-    for _ in range(iterations):
-        first, second = sample(image, uv[:, None] + plus) * light_plus, sample(image, uv[:, None] + minus) * light_minus
-        odd_part = (first - second) * _WEIGHT
-        step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
-        uv -= step
-
-    residual = ((odd_part - (D @ step[..., None])[..., 0]) ** 2).sum(1)
+    first, second = fit.values[:, : len(_HALF)], fit.values[:, len(_HALF) :]
     mean = ((first + second) @ _WEIGHT**2 / (2 * (_WEIGHT**2).sum()))[:, None]
     signal = ((first - mean) ** 2 + (second - mean) ** 2) @ _WEIGHT**2
     _, a, b, c = ((first + second) @ _CURVATURE.T).T
     ok = (
-        (4 * a * c < b * b) & (b * bright >= 0) & (residual < 0.5 * signal) & np.isfinite(uv).all(1)
+        (4 * a * c < b * b) & (b * bright >= 0) & (fit.residual < 0.5 * signal) & np.isfinite(fit.uv).all(1)
     )  # a dark square's middle is symmetric too, but no saddle
-    ok &= (_to_border(image, uv) > _MIN_WINDOW_PX) & (np.linalg.norm(uv - start, axis=1) < 0.5 * scale * long + 1)
-    sigma = _sigma(residual / (_WEIGHT**2).sum() / 2, gain, scale[:, None, None] ** 2 * metric, ok)
+    ok &= (_to_border(image, fit.uv) > _MIN_WINDOW_PX) & (np.linalg.norm(fit.uv - uv, axis=1) < 0.5 * scale * long + 1)
+    sigma = _sigma(fit.residual / (_WEIGHT**2).sum() / 2, fit.gain, scale[:, None, None] ** 2 * metric, ok)
     if ok.any():
         ok &= sigma < _MUCH_WORSE * middling(sigma[ok])
-    return CornerFit(uv - _drawn_by_blur(maps), sigma, ok)
+    return CornerFit(fit.uv - _drawn_by_blur(maps), sigma, ok)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where the descent has led each corner."""
+
+    uv: Array  # (n, 2) px
+    step: Array  # (n, 2) px, the last one
+    values: Smoothed  # (n, 2 pairs) of the windows in even light, before that step
+    residual: Array  # (n,) weighted sum of squares
+    gain: Array  # (n, 2, pairs) from differences to steps
+    light: Array  # (n, 2 pairs) factors that make it even
+
+
+def _descend(image: Smoothed, uv: Array, points: Array, light: Array | None, iterations: int) -> _Descent:
+    """Move corners uv (n, 2) by Gauss-Newton; points (2, n, 2 pairs) px are the windows, `light` is found where it is None."""
+    u, v = uv.T[:, :, None] + points
+    right, left, below, above = _at(image, u + 0.5, v), _at(image, u - 0.5, v), _at(image, u, v + 0.5), _at(image, u, v - 0.5)
+    if light is None:
+        slope = _light_slope(uv, (right + left + below + above).sum(1) / len(_HALF))
+        light = 1 - points[0] * slope[:, :1] - points[1] * slope[:, 1:]
+    x, y = (_WEIGHT * _difference(ahead - behind) for ahead, behind in ((right, left), (below, above)))
+    xx, xy, yy = ((a * b).sum(1)[:, None] for a, b in ((x, x), (x, y), (y, y)))
+    stiff = np.maximum(1e-9, 1e-6 * (xx + yy))
+    xx, yy = xx + stiff, yy + stiff
+    gain = np.stack([yy * x - xy * y, xx * y - xy * x], axis=1) / (xx * yy - xy**2)[:, None]
+    uv = uv.copy()
+    for _ in range(iterations):
+        values = _at(image, uv[:, :1] + points[0], uv[:, 1:] + points[1]) * light
+        odd_part = _difference(values) * _WEIGHT
+        step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
+        uv -= step
+    residual = ((odd_part - x * step[:, :1] - y * step[:, 1:]) ** 2).sum(1)
+    return _Descent(uv, step, values, residual, gain, light)
+
+
+def _difference(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return what the first point of each pair has more than the second, of values (n, 2 pairs)."""
+    return values[:, : len(_HALF)] - values[:, len(_HALF) :]
 
 
 def _light_slope(uv: Array, level: Array) -> Array:

@@ -1,10 +1,9 @@
-"""All images of one camera to board corners: in threads, in order, few images in memory, from the cache where they were seen before."""
+"""All images of one camera to board corners: several at once, in order, few in memory, from the cache where they were seen before."""
 
-import os
 from collections import Counter, deque
-from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -12,9 +11,9 @@ from threadpoolctl import threadpool_limits
 from calibkit.data.observations import BoardViews, ImageFrame
 from calibkit.data.plural import counted
 from calibkit.data.progress import Progress
-from calibkit.detection.boards import detect
-from calibkit.detection.cache import CornerCache, Entry
-from calibkit.detection.found import NOTHING, Tags
+from calibkit.detection.cache import CornerCache
+from calibkit.detection.crew import Answers, Crew
+from calibkit.detection.found import NOTHING, Entry, Tags
 from calibkit.errors import BadInputError, one_line
 from calibkit.models.board import AprilGrid, Board, Charuco, Checkerboard, CircleGrid
 from calibkit.opencv import cv2
@@ -24,6 +23,9 @@ from calibkit.opencv import cv2
 BIAS_PX = {AprilGrid.kind: 0.004, Checkerboard.kind: 0.004, Charuco.kind: 0.004, CircleGrid.kind: 0.03}
 _NAMED = 3  # broken images named one by one
 _WRONG_LAYOUT = 0.25  # of the tags in an image: one column too many misplaces four fifths, a right target hardly any
+_SHORT_BATCH, _LONG_BATCH = 4, 20  # consecutive images that are looked through together
+_SOME = 32  # images in short batches, so that a few are shared out evenly
+_BATCH_BYTES = 32 * 2**20  # as stored
 _STRAY = 0.05  # of all tags, worth a warning
 Outcome = tuple[int, str, "Entry | BadInputError"]  # stamp, label, what came of the frame
 
@@ -32,7 +34,7 @@ def find_boards(
     frames: Iterable[ImageFrame], board: Board, camera: str, cache: CornerCache | None, progress: Progress, total: int | None = None
 ) -> BoardViews:
     """Return the board's corners in every frame that shows it; frames that cannot be decoded are counted and named in the warnings."""
-    outcomes = list(progress(_of_one_size(_in_order(frames, board, cache), camera), f"boards in {camera}", total))
+    outcomes = list(progress(_of_one_size(_in_order(frames, board, cache, total or 0), camera), f"boards in {camera}", total))
     broken = [f"{label}: {result}" for _, label, result in outcomes if isinstance(result, BadInputError)]
     if broken and len(broken) == len(outcomes):
         raise BadInputError(f"{camera}: none of {counted(len(broken), 'image')} can be read, the first: {one_line(broken[0], 160)}")
@@ -117,37 +119,49 @@ def _about_tags(tags: list[Tags], camera: str) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _in_order(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None) -> Generator[Outcome, None, None]:
-    """Yield each frame's outcome in the frames' order, at most a few frames per worker under way."""
-    workers = os.cpu_count() or 1
-    waiting: deque[Future[Outcome]] = deque()
-    with _one_thread_each():
-        pool = ThreadPoolExecutor(workers, thread_name_prefix="boards")
-        try:
-            for frame in frames:
-                waiting.append(pool.submit(_look, frame, board, cache))
-                if len(waiting) >= 3 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:  # an interrupt or an error: what has not begun is dropped
-            pool.shutdown(wait=True, cancel_futures=True)
+def _in_order(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None, total: int) -> Generator[Outcome, None, None]:
+    """Yield each frame's outcome in the frames' order, a few batches per worker under way."""
+    waiting: deque[tuple[list[_Asked], Callable[[], Answers]]] = deque()
+    n = 0
+    with _one_thread_each(), closing(Crew(board)) as crew:
+        for batch in _batches(frames, board, cache):
+            missing = [asked.frame for asked in batch if asked.known is None]
+            waiting.append((batch, crew.submit(missing, total - n) if missing else list))
+            n += len(batch)
+            if len(waiting) > 2 * crew.workers:
+                yield from _outcomes(*waiting.popleft(), cache)
+        while waiting:
+            yield from _outcomes(*waiting.popleft(), cache)
 
 
-def _look(frame: ImageFrame, board: Board, cache: CornerCache | None) -> Outcome:
-    key = cache.key(frame.payload, board) if cache else b""
-    entry = cache.get(key, board) if cache else None
-    if entry is None:
-        try:
-            image = frame.decode()
-            entry = (image.shape[1], image.shape[0]), detect(image, board)
-        except BadInputError as error:
-            return frame.t_ns, frame.label, error
-        except cv2.error as error:  # one odd image must not end the run
-            return frame.t_ns, frame.label, BadInputError(f"OpenCV cannot work on it ({one_line(error, 80)})")
-        if cache:
-            cache.put(key, *entry)
-    return frame.t_ns, frame.label, entry
+class _Asked(NamedTuple):
+    frame: ImageFrame
+    key: bytes  # in the cache
+    known: Entry | None  # from there
+
+
+def _batches(frames: Iterable[ImageFrame], board: Board, cache: CornerCache | None) -> Iterator[list[_Asked]]:
+    """Divide the frames into runs, short ones first; the same on any machine, since a run is followed as a video."""
+    batch: list[_Asked] = []
+    n, n_bytes = 0, 0
+    for frame in frames:
+        key = cache.key(frame.payload, board) if cache else b""
+        batch.append(_Asked(frame, key, cache.get(key, board) if cache else None))
+        n, n_bytes = n + 1, n_bytes + len(frame.payload)
+        if len(batch) == (_LONG_BATCH if n > _SOME else _SHORT_BATCH) or n_bytes > _BATCH_BYTES:
+            yield batch
+            batch, n_bytes = [], 0
+    if batch:
+        yield batch
+
+
+def _outcomes(batch: list[_Asked], answers: Callable[[], Answers], cache: CornerCache | None) -> Iterator[Outcome]:
+    found = iter(answers())
+    for frame, key, known in batch:
+        answer = known or next(found)
+        if cache and known is None and not isinstance(answer, BadInputError):
+            cache.put(key, *answer)
+        yield frame.t_ns, frame.label, answer
 
 
 @contextmanager

@@ -30,6 +30,7 @@ class Detection:
     tags: Tags = Tags()  # of an AprilGrid, which numbers its tags by their codes
 
 
+Entry = tuple[tuple[int, int], Detection]  # image width and height, what was found
 NOTHING = Detection(np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0))
 
 

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -106,26 +105,33 @@ class _Neighbours:
     """What local maps around some corners are made of, whatever image they are in."""
 
     near: NDArray[np.intp]  # (n, k) corners around each, itself included
-    gain: Array  # (n, 10, k) from their uv to the map
-    foretold: Array  # (n, k) from their uv to where a stiffer map has the corner
+    gain: Array  # (n, 6, k) from their uv to the map's J and Q, and to where a stiffer map has the corner
     misfit: Array  # (n,) from a corner's distance to that place, to its distance from where its neighbours alone have it
 
 
-@lru_cache(maxsize=8)  # most images of a recording show all corners
+@lru_cache(maxsize=32)  # most images of a recording show all corners, or those that the one before has shown
 def _neighbours(points: bytes, reach: float) -> _Neighbours:
     xy = np.frombuffer(points).reshape(-1, 2)
-    near = cKDTree(xy).query(xy, min(_NEIGHBOURS, len(xy)))[1].reshape(len(xy), -1)
-    x, y = np.moveaxis(xy[near] - xy[:, None], -1, 0) / reach
+    near = _nearest(xy, min(_NEIGHBOURS, len(xy)))
+    x, y = (xy[near, axis] - xy[:, axis, None] for axis in (0, 1))
+    x, y = x / reach, y / reach
     xx, yy = x * x, y * y
-    terms = np.stack([np.ones_like(x), x, y, xx / 2, x * y, yy / 2, x * xx / 6, xx * y / 2, x * yy / 2, y * yy / 6], axis=-1)
-    weighted = np.swapaxes(terms * np.exp(-(xx + yy) / 2)[..., None], 1, 2)
-    inverse = np.linalg.inv(weighted @ terms + _STIFF)
-    units = np.repeat(1 / reach ** np.arange(4), [1, 2, 3, 4])[:, None]
+    terms = np.stack([np.ones_like(x), x, y, xx / 2, x * y, yy / 2, x * xx / 6, xx * y / 2, x * yy / 2, y * yy / 6], axis=1)
+    weighted = terms * np.exp(-(xx + yy) / 2)[:, None]
+    normal = weighted @ np.swapaxes(terms, 1, 2)
+    units = np.repeat(1 / reach ** np.arange(1, 3), [2, 3])[:, None]
     # A wrong corner at the board's rim would bend a cubic to itself: whether it belongs is asked of the first six terms
-    stiffer = weighted[:, :6]
-    first = np.linalg.inv(stiffer @ terms[..., :6] + _STIFF[:6, :6])[:, :1]
+    first = np.linalg.inv(normal[:, :6, :6] + _STIFF[:6, :6])[:, :1]
     leverage = np.minimum(first[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1, its terms are 1, 0, 0, ...
-    return _Neighbours(near, units * (inverse @ weighted), (first @ stiffer)[:, 0], 1 / np.sqrt(1 - leverage))
+    gain = np.concatenate([units * (np.linalg.inv(normal + _STIFF)[:, 1:6] @ weighted), first @ weighted[:, :6]], axis=1)
+    return _Neighbours(near, gain, 1 / np.sqrt(1 - leverage))
+
+
+def _nearest(xy: Array, k: int) -> NDArray[np.intp]:
+    """Return the k points nearest to each of xy (n, 2), itself included, as (n, k)."""
+    squares = (xy**2).sum(1)
+    near = [np.argpartition(squares - 2 * some @ xy.T, k - 1, axis=1)[:, :k] for some in np.array_split(xy, 1 + len(xy) // 1000)]
+    return np.concatenate(near)
 
 
 def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
@@ -137,9 +143,8 @@ def local_maps(xy: Array, uv: Array, reach: float) -> tuple[LocalMaps, Array]:
     """
     around = _neighbours(np.ascontiguousarray(xy, float).tobytes(), reach)
     c = around.gain @ uv[around.near]
-    foretold = (around.foretold[:, None] @ uv[around.near])[:, 0]
-    misfit: Array = np.linalg.norm(uv - foretold, axis=-1) * around.misfit
-    return LocalMaps(np.swapaxes(c[:, 1:3], 1, 2), c[:, 3:6]), misfit
+    misfit: Array = np.linalg.norm(uv - c[:, 5], axis=-1) * around.misfit
+    return LocalMaps(np.swapaxes(c[:, :2], 1, 2), c[:, 2:5]), misfit
 
 
 def in_line(misfit: Array, allowed_px: Array) -> NDArray[np.bool_]:

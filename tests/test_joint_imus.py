@@ -1,5 +1,6 @@
 """Several IMUs on one trajectory: where each sits, how it lies and how late its clock is, with sigmas that mean what they say."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -98,15 +99,17 @@ def test_a_rich_recording_passes_and_the_lines_say_where_the_imu_sits() -> None:
     assert not result.not_observable
     place = "imu1 sits at (12"
     assert any(place in line for line in result.facts["lines"]), result.facts["lines"]
-    assert any("t_imu0 = t_imu1 + dt: imu1's stamps are 12.3" in line for line in result.facts["lines"])
+    said = re.search(r"t_imu0 = t_imu1 \+ dt: imu1's stamps are (\S+) ms early", "; ".join(map(str, result.facts["lines"])))
+    assert said is not None
+    assert float(said[1]) == pytest.approx(1e3 * DT, abs=0.06)  # 4 sigma
 
 
 def test_the_same_imu_twice_sits_in_one_place() -> None:
     recording = recorded(3)
     joint, _, _ = told(recording, recording.imu)
     x = joint.fit.x.beside[0]
-    assert np.abs(se3.local(np.eye(4), x.T_imu_ref)).max() < 1e-6
-    assert abs(x.dt) < 1e-8
+    sigma = np.sqrt(np.diag(joint_trust(joint.fit).cov))[of_imu(joint)]
+    assert np.all(np.abs(np.append(se3.local(np.eye(4), x.T_imu_ref), x.dt)) < 0.05 * sigma)  # where the solver stops
 
 
 def test_a_second_imu_of_another_unit_is_named() -> None:

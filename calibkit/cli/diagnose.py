@@ -19,6 +19,7 @@ def run(
     rig: Annotated[list[Path], typer.Option("--rig", metavar="RIG.yaml", help="The calibration to test; repeatable, merged.")],
     camera: options.CamerasOfRig = None,
     imu: options.Imu = None,
+    no_imu: Annotated[bool, typer.Option("--no-imu", help="Test lenses and places of cameras alone, though there is an IMU.")] = False,
     temperature: options.Temperature = None,
     json_file: options.Json = None,
     gravity: options.LocalGravity = None,
@@ -31,19 +32,28 @@ def run(
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
 ) -> None:
-    """Test a camera-IMU calibration against a new recording before a board: is it still right, and if not, what is wrong and by how much.
+    """Test a calibration against a new recording before a board: is it still right, and if not, what is wrong and by how much.
 
     The recording asks for a calibration of its own; the fewest causes that explain its difference to the rig file's, both uncertainties
-    paid for, are named with size and sigma: clock, mount, lens, board, IMU, and what drifts. By chance alone one is named in 1 of 100
-    recordings. Exit code 0: it fits; 1: a cause is found; 2: bad input.
+    paid for, are named with size and sigma: clock, mount, lens, board, IMU, and what drifts; without an IMU lenses, the places of cameras
+    beside each other, and the board. By chance alone one is named in 1 of 100 recordings. Exit code 0: it fits; 1: a cause is found; 2: bad
+    input.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import tell
+    from calibkit.errors import BadInputError
+    from calibkit.stages.camera_imu import has_imu
     from calibkit.stages.diagnose import Options, run_diagnosis
+    from calibkit.stages.diagnose_cameras import diagnose_cameras
 
     known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force)
     read = options.sensors(
         camera, [imu] if imu else None, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
     asked = Options(**read, temperature=temperature)
-    tell(run_diagnosis(sources, target, known, asked, bar), json_file, force)
+    alone = no_imu or not has_imu(sources, asked)
+    if alone and (temperature or imu):
+        raise BadInputError(
+            f"{'--temperature' if temperature else '--imu'} is for cameras with an IMU: leave it out, or give the IMU's recording"
+        )
+    tell((diagnose_cameras if alone else run_diagnosis)(sources, target, known, asked, bar), json_file, force)

@@ -19,10 +19,11 @@ class About:
     """What the words are of."""
 
     cameras: tuple[str, ...]
-    imu: str
+    imu: str  # what the cameras sit beside: the IMU, or without one the first camera
     models: tuple[CameraModel, ...]
     lenses: tuple[Array, ...]
     corners: tuple[Array, ...]  # (n, 2) px where each camera saw the board
+    again: str = "joint"  # the command that finds where they sit
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ def in_words(cause: Cause, about: About) -> Told:
         off = np.linalg.norm(bending(cause.theta, about, k)[1], axis=1)
         said += f": corners are off by {np.sqrt(np.mean(off**2)):.2g} px rms, {off.max():.2g} px at most, focal length and centre set anew"
     cure = _DRIFTS[drift] if drift else mend
-    mended = cure.format(camera=about.cameras[k], imu=about.imu)
+    then = "" if about.again == "intrinsics" else f", then {about.again}"
+    mended = cure.format(camera=about.cameras[k], imu=about.imu, again=about.again, then=then)
     alike = tuple(named(key, about) for key in cause.alike)
     return Told(said, mended, tuple(theta.tolist()), tuple(sigma.tolist()), f"{unit}{per}", alike)
 
@@ -114,7 +116,7 @@ def _board(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
     return f"the board is {size} {'larger' if theta[0] > 0 else 'smaller'} than its file says"
 
 
-_LENS, _MOUNT = "run calibkit intrinsics again, then joint", "its mount has moved: run calibkit joint again, and look at the mount"
+_LENS, _MOUNT = "run calibkit intrinsics again{then}", "its mount has moved: run calibkit {again} again, and look at the mount"
 # By name: unit, its worth of one in SI, what is said, what to do.
 _SAYINGS: dict[str, tuple[str, float, Say, str]] = {
     "dt": ("ms", 1e3, _offset, "run calibkit timeoffset or joint again"),

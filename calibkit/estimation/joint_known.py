@@ -15,6 +15,8 @@ from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
 from calibkit.models.imu import ImuModel
 
+_ALONE = "; calibkit diagnose --no-imu tests cameras alone"
+
 
 def known_calibration(rig: Rig, cameras: Sequence[str], imu: str, model: ImuModel) -> Known:
     """Return what the rig file says of the cameras beside the IMU; BadInputError where it lacks one, or has one that is not observable."""
@@ -22,7 +24,7 @@ def known_calibration(rig: Rig, cameras: Sequence[str], imu: str, model: ImuMode
     for name in cameras:
         camera, entry, dt = rig.cameras[name], _transform(rig, name, imu), find_time_offset(rig, imu, name)
         if dt is None or dt.value is None:
-            raise BadInputError(f"the rig file has no dt_{imu}_{name}: run calibkit joint first")
+            raise BadInputError(f"the rig file has no dt_{imu}_{name}: run calibkit joint first{_ALONE}")
         lens = np.array([camera.parameters[p].value for p in CAMERAS[camera.model].parameter_names], float)
         delay = 0.0 if camera.line_delay is None else camera.line_delay.value or 0.0
         states.append(CameraState(np.array(entry.matrix), dt.value, lens, delay))
@@ -35,7 +37,7 @@ def _transform(rig: Rig, name: str, imu: str) -> Transform:
     if entry is None and f"T_{imu}_{name}" in rig.transforms:
         entry = inverse_transform(f"T_{imu}_{name}", rig.transforms[f"T_{imu}_{name}"])
     if entry is None:
-        raise BadInputError(f"the rig file has no T_{name}_{imu}: run calibkit joint first")
+        raise BadInputError(f"the rig file has no T_{name}_{imu}: run calibkit joint first{_ALONE}")
     if entry.status is Status.NOT_OBSERVABLE:
         raise BadInputError(f"T_{name}_{imu} is not observable by the rig file: there is nothing to test; calibrate it first")
     return entry

@@ -19,8 +19,11 @@ _BIAS_INSTANTS = 60
 _BIAS_PATCHES = (4, 3)
 
 
-def lens_covariance(fit: LensFit) -> Covariance:
-    """Return the covariance of the border (lenses, then T_cam_cam0 of camera 1, 2, ...), plain and corrected."""
+def lens_covariance(fit: LensFit, least: float = 0.0) -> Covariance:
+    """Return the covariance of the border (lenses, then T_cam_cam0 of camera 1, 2, ...), plain and corrected.
+
+    The corrected variance is in no direction below `least` times the plain one.
+    """
     S, scores = fit.problem.information(fit.state)
     chi2, corners = 0.0, 0
     for c, camera in enumerate(fit.problem.cameras):
@@ -29,7 +32,7 @@ def lens_covariance(fit: LensFit) -> Covariance:
         corners += int(np.sum(camera.weight > 0))
     freedom = max(2 * corners - 6 * len(fit.state.T_cam0_board) - S.shape[-1], 1)
     scales = border_scales(fit.problem, fit.state.lenses)
-    found = covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, scales, fit.problem.prior(fit.state.lenses)[1])
+    found = covariance_in_time(S, scores, instant_times(fit), chi2 / freedom, scales, fit.problem.prior(fit.state.lenses)[1], least)
     return replace(found, corrected=found.corrected + _bias_covariance(fit))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibkit.data.rig import TRANSFORM_PARAMETERS, Covariance, Estimate, Rig, TimeOffset, Transform
-from calibkit.data.transforms import TANGENT, frames_of, make_time_offset, make_transform
+from calibkit.data.transforms import TANGENT, find_transform, frames_of, make_time_offset, make_transform
 from calibkit.data.verdict import Status
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -63,6 +63,24 @@ def tangent_covariance(entry: Transform) -> Array:
         return np.zeros((6, 6))
     at = [entry.covariance.order.index(name) for name in TANGENT]
     return np.array(entry.covariance.matrix)[np.ix_(at, at)]
+
+
+def chained(rig: Rig, a: str, b: str) -> tuple[Array, Array] | None:
+    """Return T_a_b by the shortest chain of the rig's transforms and its covariance (6, 6); None where nothing known joins the frames.
+
+    T_1 exp(d_1) T_2 exp(d_2) = T_1 T_2 exp(Ad_{T_2^-1} d_1 + d_2); the errors of the steps are taken to have nothing in common.
+    """
+    found = find_transform(rig, a, b)
+    if found is None or any(rig.transforms[name].status is Status.NOT_OBSERVABLE for name in found[1]):
+        return None
+    cov, frame = np.zeros((6, 6)), a
+    for name in found[1]:
+        entry, (left, right) = rig.transforms[name], frames_of(name)
+        if left != frame:
+            entry, right = inverse_transform(name, entry), left
+        frame, into = right, se3.adjoint(np.array(entry.inverse_matrix))
+        cov = into @ cov @ into.T + tangent_covariance(entry)
+    return found[0], cov
 
 
 def inverse_transform(name: str, entry: Transform) -> Transform:

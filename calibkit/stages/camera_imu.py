@@ -51,20 +51,30 @@ class ImuRead:
 
 
 @dataclass(frozen=True)
-class CameraImu:
-    """What was read, and what the rig file says of it."""
+class CamerasRead:
+    """What was read of cameras, and what the rig file says of them."""
 
     recording: Recording
     board: Board
     views: tuple[BoardViews, ...]
     lenses: tuple[Camera, ...]  # in the order of views
-    imus: tuple[ImuRead, ...]
-    gravity: GravityPrior
-    inputs: tuple[tuple[str, str | None], ...]
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(each.camera for each in self.views)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [*self.recording.warnings, *(text for each in self.views for text in each.warnings)]
+
+
+@dataclass(frozen=True)
+class CameraImu(CamerasRead):
+    """What was read, and what the rig file says of it."""
+
+    imus: tuple[ImuRead, ...]
+    gravity: GravityPrior
+    inputs: tuple[tuple[str, str | None], ...]
 
     @property
     def imu(self) -> ImuRead:
@@ -74,10 +84,6 @@ class CameraImu:
     def stamps(self) -> dict[str, StampReport]:
         imus = {each.name: check_stamps(each.input.samples.t_ns, "sample") for each in self.imus}
         return imus | {each.camera: check_stamps(each.t_ns, "frame") for each in self.views}
-
-    @property
-    def warnings(self) -> list[str]:
-        return [*self.recording.warnings, *(text for each in self.views for text in each.warnings)]
 
     def settings(self, extras: Sequence[str] = (), spacing: float | None = None) -> Settings:
         """Return how to fit, beside what is free of the IMU's model."""
@@ -112,12 +118,36 @@ def read_camera_imu(
     named = name_imus(recording, base, sensors.imus)
     lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
     imus = tuple(_imu(recording, base, name, topic, free, progress) for name, topic in named.items())
-    resolution = next(iter(lenses.values())).resolution
-    views = tuple(observe(recording, topics, board, LensOptions(resolution=resolution, cache=sensors.cache), progress))
+    views = _views(recording, topics, board, lenses, sensors, progress)
     gravity = GravityPrior(sensors.gravity.value, max(sensors.gravity.sigma, _GRAVITY_SIGMA))
     inputs = (*recording.inputs(), (target.name, sha256(target.read_bytes()).hexdigest()))
-    of_views = tuple(lenses[each.camera] for each in views)
-    return CameraImu(recording, board, views, of_views, imus, gravity, inputs)
+    return CameraImu(recording, board, views, tuple(lenses[each.camera] for each in views), imus, gravity, inputs)
+
+
+def read_cameras(sources: Sequence[Path], target: Path, base: Rig, sensors: Sensors, progress: Progress) -> CamerasRead:
+    """Return the corners of all cameras, of a recording without an IMU or of one whose IMU does not matter.
+
+    BadInputError names the file, topic or option that is wrong.
+    """
+    board = load_target(target)
+    recording = open_recording(list(sources), sensors.ros_distro, sensors.reading)
+    topics = name_cameras(recording, _known(base, sensors.cameras))
+    lenses = {camera: _lens(base, camera, stream) for camera, stream in topics.items()}
+    views = _views(recording, topics, board, lenses, sensors, progress)
+    return CamerasRead(recording, board, views, tuple(lenses[each.camera] for each in views))
+
+
+def has_imu(sources: Sequence[Path], sensors: Sensors) -> bool:
+    """Whether an IMU is asked for or recorded."""
+    topics = open_recording(list(sources), sensors.ros_distro, sensors.reading).topics
+    return bool(sensors.imus) or any(topic.kind == "imu" for topic in topics)
+
+
+def _views(
+    recording: Recording, topics: dict[str, str], board: Board, lenses: dict[str, Camera], sensors: Sensors, progress: Progress
+) -> tuple[BoardViews, ...]:
+    resolution = next(iter(lenses.values())).resolution
+    return tuple(observe(recording, topics, board, LensOptions(resolution=resolution, cache=sensors.cache), progress))
 
 
 def _imu(recording: Recording, base: Rig, name: str, topic: str, free: Sequence[str], progress: Progress) -> ImuRead:

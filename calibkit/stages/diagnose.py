@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from calibkit.data.observations import Times
 from calibkit.data.progress import Progress, silent
-from calibkit.data.rig import Rig
+from calibkit.data.rig import Camera, Rig
 from calibkit.errors import BadInputError, NotConvergedError
 from calibkit.estimation.diagnosis import FAMILY_WISE, Diagnosis, diagnose
 from calibkit.estimation.diagnosis_words import About, Told, in_words, named
@@ -67,6 +67,7 @@ class Diagnosed:
     untested: tuple[str, ...]
     rms: tuple[Rms, ...]
     warnings: tuple[str, ...]
+    again: str = "joint"  # the command that calibrates anew
 
     @property
     def text(self) -> str:
@@ -78,7 +79,7 @@ class Diagnosed:
             out += [f"    this motion does not tell it from: {', '.join(told.alike)}"] if told.alike else []
         left = 1 - sum(cause.share for cause in self.diagnosis.causes)
         if self.told and left > _LEFT:
-            out += ["", f"  {100 * left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit joint again"]
+            out += ["", f"  {100 * left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit {self.again} again"]
         out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
         out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
         return "\n".join([*out, "", self.verdict])
@@ -96,7 +97,8 @@ class Diagnosed:
             hide = f": noise of {worst.held:.2g} {worst.unit} for {worst.sensor} would hide it" if worst.held > _HIDES * worst.best else ""
             return f"FAIL: {self.told[0].text}; it is not noise{hide}"
         if self.unexplained:
-            return "CHECK: the calibration misses this recording by more than its sigmas, for no single cause: run calibkit joint again"
+            misses = "the calibration misses this recording by more than its sigmas, for no single cause"
+            return f"CHECK: {misses}: run calibkit {self.again} again"
         return "PASS: the calibration fits this recording within its own uncertainty" + (", but for its noise" if self.noise else "")
 
     def as_json(self) -> dict[str, object]:
@@ -231,12 +233,7 @@ def _what(joint: Joint, read: CameraImu) -> str:
 
 def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ...]:
     """Return what scatters more than the rig file has it, with everything free."""
-    found = []
-    for name, lens, each in zip(read.names, read.lenses, rms, strict=False):
-        now = each.best
-        if lens.reprojection is not None and lens.reprojection.rms_px > 0 and (factor := now / lens.reprojection.rms_px) > _NOISIER:
-            text = f"{name}'s corners scatter by {now:.3g} px, {factor:.1f} times what they did at its calibration, whatever the motion"
-            found.append(Noise(f"{text}: noise; its R is {now:.2g} px now. Blur, light, or another lens or board?", factor))
+    found = list(noisier_corners(read.names, read.lenses, rms[: len(read.names)]))
     known = read.imu.known
     for kind, density, word in (
         ("gyro", known.gyro_noise_density, "gyroscope"),
@@ -246,4 +243,15 @@ def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ..
             real = factor * density.value
             text = f"{read.imu.name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
             found.append(Noise(f"{text}: {real:.2e} {density.unit}. Vibration?", factor))
+    return tuple(found)
+
+
+def noisier_corners(names: Sequence[str], lenses: Sequence[Camera], rms: Sequence[Rms]) -> tuple[Noise, ...]:
+    """Return cameras whose corners scatter more than at their calibration, with everything free."""
+    found = []
+    for name, lens, each in zip(names, lenses, rms, strict=True):
+        now = each.best
+        if lens.reprojection is not None and lens.reprojection.rms_px > 0 and (factor := now / lens.reprojection.rms_px) > _NOISIER:
+            text = f"{name}'s corners scatter by {now:.3g} px, {factor:.1f} times what they did at its calibration, whatever the motion"
+            found.append(Noise(f"{text}: noise; its R is {now:.2g} px now. Blur, light, or another lens or board?", factor))
     return tuple(found)

@@ -3,6 +3,7 @@
 `pytest -m slow -s tests/test_diagnose.py` prints the confusion matrix of docs/diagnose.md.
 """
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -18,10 +19,11 @@ from scipy.optimize import least_squares
 from time_offset_samples import camera_session
 
 from calibkit.estimation.diagnosis import Cause, Diagnosis, Evidence, Suspect, diagnose
+from calibkit.estimation.diagnosis_signature import courses, signatures
 from calibkit.estimation.diagnosis_words import About, bending, in_words
 from calibkit.estimation.joint_problem import Drift
 from calibkit.estimation.joint_state import CameraState
-from calibkit.estimation.joint_suspects import Known, evidence, mount
+from calibkit.estimation.joint_suspects import Known, evidence, mount, with_trajectory
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
@@ -276,3 +278,66 @@ def test_mistakes_are_one_line(run: Run, late: Path, more: tuple[str, ...], rig:
     assert said.code == 2
     assert why in said.err
     assert said.err.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["diagnose", "validate"])
+def test_the_report_shows_the_causes_and_their_signatures(run: Run, late: Path, tmp_path: Path, command: str) -> None:
+    """One page for each command, no request from it, and a picture of what the clock does to the gyroscope."""
+    out = tmp_path / "report"
+    asked = ask(late, "--report", out, "--temperature", late / "warm.csv")
+    if command == "validate":
+        asked = ("validate", late / "rig.yaml", *(word for word in asked[1:] if word not in ("--rig", late / "rig.yaml")))
+    said = run(*asked)
+    assert said.code == 1
+    assert said.out.endswith(f"written: {out / 'report.html'}\n")
+    page = (out / "report.html").read_text()
+    assert len(page) < 3e6
+    assert re.search(r"FAIL</span> cam0&#39;s stamps are (2\.9|3\.0)", page.split("</header>")[0])
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    names = {path.name for path in (out / "pictures").iterdir()}
+    assert {"Causes-suspects.png", "Cause_1__dt_imu0_cam0-signature.png", "Cause_1__dt_imu0_cam0-course.png"} <= names
+    assert {"cam0-" + command + "-over_time.png", "imu0_gyro-" + command + "-imu_fit.png"} <= names
+    assert ({"Checks-speed.png", "Checks-halves.png"} <= names) is (command == "validate")
+    report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == "FAIL"
+    assert report["facts"][command]["found"]["causes"][0]["key"] == "dt 0"
+    again = run(*asked)
+    assert again.code == 2
+    assert "report.html" in again.err
+
+
+@pytest.mark.slow
+def test_a_cause_is_as_large_in_each_window_and_in_the_residuals_as_it_is_named() -> None:
+    """A clock that is late all along is level; its gyroscope's residuals are what is predicted, in size and in place."""
+    session = camera_session(2, TD, duration_s=LONG_S)
+    joint = recorded_with(FAULTS["td 2 ms"], session).fitted()
+    camera = session.tracks[0].camera
+    was = CameraState(se3.inverse(camera.T_imu_cam), TD, camera.params)
+    none = (np.zeros((6, 6)), 0.0, np.zeros((8, 8)))
+    found, suspects = evidence(joint.fit, Known((was,), ImuModel(), (none,)), [])
+    cause = diagnose(found, suspects).causes[0]
+    assert cause.key == "dt 0"
+    column = next(each.columns for each in suspects if each.key == "dt 0")
+    course = courses(joint.fit, [], {"dt 0": column[:, 0]}, {"dt 0": float(cause.theta[0])})["dt 0"]
+    assert len(course.t) > 20
+    assert 0.6 < np.sqrt(np.mean(((course.theta - 0.002) / course.sigma) ** 2)) < 1.5
+    held = with_trajectory(joint.fit.problem, replace(joint.fit.x, cameras=(was,)))
+    by_sensor = signatures(joint.fit, held, [], column @ cause.theta)
+    for kind in ("camera 0", "gyro"):  # which of them it shows in is a matter of their noise
+        each = by_sensor[kind]
+        slope = np.sum(each.left * each.predicted) / np.sum(each.predicted**2)
+        assert slope == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_creeping_mount_has_a_slope_in_its_windows() -> None:
+    session = camera_session(3, TD, duration_s=LONG_S)
+    joint = recorded_with(FAULTS["pitch with time"], session).fitted()
+    camera = session.tracks[0].camera
+    was = CameraState(se3.inverse(camera.T_imu_cam), TD, camera.params)
+    _, suspects = evidence(joint.fit, Known((was,), ImuModel(), ((np.zeros((6, 6)), 0.0, np.zeros((8, 8))),)), [])
+    column = next(each.columns for each in suspects if each.key == "R_x 0")
+    course = courses(joint.fit, [], {"R_x 0": column[:, 0]}, {"R_x 0": 0.0})["R_x 0"]
+    slope, _ = np.polyfit(course.t, course.theta, 1, w=1 / course.sigma)
+    assert slope * 60 == pytest.approx(CREEP, rel=0.15)

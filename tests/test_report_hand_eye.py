@@ -18,7 +18,7 @@ from calibkit.estimation.hand_eye_data import of_recording
 from calibkit.estimation.hand_eye_result import hand_eye_result
 from calibkit.geometry import se3, so3
 from calibkit.io.residual_file import load_result, save_residuals
-from calibkit.report.figures import PICTURES, draw
+from calibkit.report.figures import PICTURES, draw, plates
 from calibkit.report.hand_eye_figures import ELLIPSE
 from calibkit.report.page import build
 from calibkit.report.signals import measure
@@ -66,7 +66,9 @@ def poses_of(result: Result) -> View:
 
 
 def test_all_pictures_are_drawn_and_the_same_each_time(good: Result) -> None:
-    again = {f"pictures/{NAME}-handeye-{one.picture.key}.png": one.files["png"] for view in views(good) for one in draw(view, ["png"])}
+    again = {
+        f"pictures/{NAME}-handeye-{one.plate.key}.png": one.files["png"] for view in views(good) for one in draw(plates(view), ["png"])
+    }
     page = build(summarise(good.rig, [replace(good, facts={**good.facts, "tables": [*good.facts["tables"], [["<b>"]]]})]))
     assert b"<th>&lt;b&gt;</th>" in page["report.html"]
     assert {f"pictures/{NAME}-handeye-{key}.png" for key in KEYS} == again.keys()

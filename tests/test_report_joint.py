@@ -14,7 +14,7 @@ from calibkit.data.rig import Rig, StageRun
 from calibkit.data.verdict import Verdict
 from calibkit.io.residual_file import load_result, save_residuals
 from calibkit.io.rig_file import save_rig
-from calibkit.report.figures import PICTURES, draw
+from calibkit.report.figures import PICTURES, draw, plates
 from calibkit.report.joint_figures import STRETCH_S
 from calibkit.report.signals import measure, not_good
 from calibkit.report.view import views
@@ -68,7 +68,7 @@ def drawn(made, key):
 
 def test_each_set_has_its_pictures_twice_the_same():
     made = result(samples(), way())
-    first, again = ({(v.sensor, one.picture.key): one for v in views(made) for one in draw(v, ["png"])} for _ in range(2))
+    first, again = ({(v.sensor, one.plate.key): one for v in views(made) for one in draw(plates(v), ["png"])} for _ in range(2))
     assert set(first) == {("imu0_gyro", key) for key in ("imu_fit", "whiteness", "residual_rate")} | {("imu0", "biases"), ("imu0", "way")}
     for key, one in first.items():
         assert (one.svg, one.files) == (again[key].svg, again[key].files)
@@ -211,4 +211,4 @@ def test_absurd_columns_are_left_out(key):
     column[3] = np.nan
     (view,) = views(result(replace(made, context={**made.context, key: column})))
     assert len(view.raw) == len(made.raw) - 1
-    draw(view)
+    draw(plates(view))

@@ -53,12 +53,12 @@ def test_one_page_that_needs_nothing_from_outside():
     checked = Checker(html)
     assert checked.open == []
     assert all(source.startswith("data:") for source in checked.loaded)
-    assert len(checked.loaded) == 1 + 4 + 10
+    assert len(checked.loaded) == 1 + 5 + 10
     assert "script" not in checked.tags
     assert not re.search(r"@import|url\(", html)
     assert len(files["report.html"]) < 3e6
     assert sorted(files) == [
-        *(f"pictures/cam0-intrinsics-{key}.png" for key in ("coverage", "field", "frames", "scatter")),
+        *(f"pictures/cam0-intrinsics-{key}.png" for key in ("coverage", "field", "frames", "over_time", "scatter")),
         "report.html",
         "report.json",
         "report.md",

@@ -14,7 +14,7 @@ from calibkit.data.verdict import Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.io import residual_file
 from calibkit.io.residual_file import load_result, save_residuals
-from calibkit.report.figures import PICTURES, draw
+from calibkit.report.figures import PICTURES, draw, plates
 from calibkit.report.growth import growth
 from calibkit.report.look import ACCENT
 from calibkit.report.page import build
@@ -113,7 +113,7 @@ CASES = {
 
 def drawn_of(made):
     """Return the drawn pictures by key."""
-    return {one.picture.key: one for view in views(made) for one in draw(view, ["png"])}
+    return {one.plate.key: one for view in views(made) for one in draw(plates(view), ["png"])}
 
 
 def signals_of(made):

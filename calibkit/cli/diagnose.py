@@ -21,6 +21,7 @@ def run(
     imu: options.Imu = None,
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Test lenses and places of cameras alone, though there is an IMU.")] = False,
     temperature: options.Temperature = None,
+    report: options.Report = None,
     json_file: options.Json = None,
     gravity: options.LocalGravity = None,
     latitude: options.Latitude = None,
@@ -43,17 +44,23 @@ def run(
     from calibkit.cli.shown import tell
     from calibkit.errors import BadInputError
     from calibkit.stages.camera_imu import has_imu
-    from calibkit.stages.diagnose import Options, run_diagnosis
+    from calibkit.stages.diagnose import Options, examine
     from calibkit.stages.diagnose_cameras import diagnose_cameras
 
-    known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force)
+    known = options.tested([*sources, target, *([temperature] if temperature else [])], rig, json_file, force, report)
     read = options.sensors(
         camera, [imu] if imu else None, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
     asked = Options(**read, temperature=temperature)
     alone = no_imu or not has_imu(sources, asked)
-    if alone and (temperature or imu):
-        raise BadInputError(
-            f"{'--temperature' if temperature else '--imu'} is for cameras with an IMU: leave it out, or give the IMU's recording"
-        )
-    tell((diagnose_cameras if alone else run_diagnosis)(sources, target, known, asked, bar), json_file, force)
+    given = {"--temperature": temperature, "--imu": imu, "--report": report}
+    if alone and (wrong := [name for name, value in given.items() if value]):
+        raise BadInputError(f"{wrong[0]} is for cameras with an IMU: leave it out, or give the IMU's recording")
+    if alone:
+        tell(diagnose_cameras(sources, target, known, asked, bar), json_file, force)
+    found = examine(sources, target, known, asked, bar)
+    if report is not None:
+        from calibkit.stages.diagnose_report import write_diagnosis
+
+        write_diagnosis(found, report, options.command())
+    tell(found.diagnosed, json_file, force, report)

@@ -40,7 +40,7 @@ def run(
     from calibkit.stages.camera_imu import Sensors
     from calibkit.stages.observability import observability
 
-    known = options.tested([*sources, target], rig, json_file, force)
+    known = options.tested([*sources, target], rig, json_file, force, None)
     read = options.sensors(
         camera, [imu] if imu else None, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )

@@ -73,7 +73,12 @@ def outputs_of(
 
     refuse_clashes(inputs, [out, report, json_file, *others])
     refuse_clashes(rigs or (), [report, json_file, *others])  # OUT may be a rig: it is then updated
-    return Outputs(out, report, json_file, tuple(rigs or ()), force, command=shlex.join(["calibkit", *sys.argv[1:]]))
+    return Outputs(out, report, json_file, tuple(rigs or ()), force, command=command())
+
+
+def command() -> str:
+    """Return the command line as it was typed."""
+    return shlex.join(["calibkit", *sys.argv[1:]])
 
 
 def sensors(
@@ -102,13 +107,18 @@ def tested(
     rigs: list[Path],
     json_file: Path | None,
     force: bool,
+    report: Path | None,
 ) -> "Rig":
-    """Return the merged rigs that are tested, before long work; BadInputError where the only output is an input or exists."""
+    """Return the merged rigs that are tested, before long work; BadInputError where an output is an input or exists."""
     from calibkit.cli.paths import refuse_clashes
     from calibkit.io.atomic import refuse_unwritable
     from calibkit.io.rig_file import load_rig, merge_rigs
 
-    refuse_clashes([*inputs, *rigs], [json_file])
+    refuse_clashes([*inputs, *rigs], [json_file, report])
+    if report is not None:
+        from calibkit.stages.report import check_out_dir
+
+        check_out_dir(report, force)
     if json_file is not None:
         refuse_unwritable(json_file, force)
     return merge_rigs([(path, load_rig(path)) for path in rigs])

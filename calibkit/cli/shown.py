@@ -1,7 +1,7 @@
 """How a stage ends on the terminal: warnings, the numbers, the verdict, the files; then the exit code."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import typer
 
@@ -42,8 +42,8 @@ class Told(Protocol):
     def as_json(self) -> dict[str, object]: ...
 
 
-def tell(found: Told, json_file: Path | None, force: bool) -> None:
-    """Print what was found, write it as JSON where that is asked for, and leave with its exit code."""
+def tell(found: Told, json_file: Path | None, force: bool, report: Path | None = None) -> NoReturn:
+    """Print what was found and which report was written, write it as JSON where that is asked for, and leave with its exit code."""
     from calibkit.errors import one_line
     from calibkit.io.atomic import write_json
 
@@ -53,4 +53,6 @@ def tell(found: Told, json_file: Path | None, force: bool) -> None:
     if json_file is not None:
         write_json(json_file, found.as_json(), force)
         typer.echo(f"written: {one_line(json_file)}")
+    if report is not None:
+        typer.echo(f"written: {one_line(report / 'report.html')}")
     raise typer.Exit(found.exit_code)

@@ -20,6 +20,7 @@ def run(
     camera: options.CamerasOfRig = None,
     imu: options.Imu = None,
     temperature: options.Temperature = None,
+    report: options.Report = None,
     json_file: options.Json = None,
     gravity: options.LocalGravity = None,
     latitude: options.Latitude = None,
@@ -41,9 +42,14 @@ def run(
     from calibkit.stages.diagnose import Options
     from calibkit.stages.validate import validate
 
-    known = options.tested([*sources, target, *([temperature] if temperature else [])], [rig], json_file, force)
+    known = options.tested([*sources, target, *([temperature] if temperature else [])], [rig], json_file, force, report)
     read = options.sensors(
         camera, [imu] if imu else None, (rate, gyro_unit, accel_unit), options.gravity_of(gravity, latitude, altitude), no_cache, ros_distro
     )
     asked = Options(**read, temperature=temperature)
-    tell(validate(sources, target, known, asked, bar), json_file, force)
+    found = validate(sources, target, known, asked, bar)
+    if report is not None:
+        from calibkit.stages.validate_report import write_validation
+
+        write_validation(found, report, options.command())
+    tell(found, json_file, force, report)

@@ -54,8 +54,19 @@ class Cause:
 
 
 @dataclass(frozen=True)
+class Alone:
+    """A suspect as if it were the only cause."""
+
+    theta: Array  # (d,)
+    cov: Array  # (d, d)
+    log_p: float
+    share: float  # of what the data lose by the calibration: what mending it alone brings back; negative where that makes it worse
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     causes: tuple[Cause, ...]
+    alone: dict[str, Alone]  # every suspect
     sigmas: dict[str, float]  # of each suspect alone, in units of what must be known: the least that would be found is some 4 times that
     unexplained_log_p: float  # of what the causes leave
 
@@ -83,16 +94,14 @@ def diagnose(evidence: Evidence, suspects: Sequence[Suspect]) -> Diagnosis:
                 chosen = others
     theta, cov = scaled.sizes(columns, chosen)
     causes, left, start = [], scaled.delta, 0
-    whole = float(left @ scaled.information @ left)
     for key in chosen:
         part = slice(start, start := start + columns[key].shape[1])
-        before = float(left @ scaled.information @ left)
-        left = left - columns[key] @ theta[part]
-        share = (before - float(left @ scaled.information @ left)) / max(whole, 1e-300)
-        causes.append(Cause(key, theta[part], cov[part, part], log_p[key], share, alike[key]))
+        before, left = left, left - columns[key] @ theta[part]
+        causes.append(Cause(key, theta[part], cov[part, part], log_p[key], scaled.share(before, left), alike[key]))
+    alone = {key: scaled.alone(columns, key) for key in columns}
     sigmas = {key: scaled.sigma(each) for key, each in columns.items()}
     rest = scaled.chi2 - scaled.evidence(columns, chosen)
-    return Diagnosis(tuple(causes), sigmas, scaled.log_p(max(rest, 0.0), len(evidence.delta) - len(theta)))
+    return Diagnosis(tuple(causes), alone, sigmas, scaled.log_p(max(rest, 0.0), len(evidence.delta) - len(theta)))
 
 
 @dataclass(frozen=True)
@@ -128,6 +137,16 @@ class _Scaled:
         theta, _ = self.sizes(columns, keys)
         C = np.concatenate([columns[key] for key in keys], axis=1)
         return float(theta @ C.T @ self.M @ self.delta)
+
+    def share(self, before: Array, after: Array) -> float:
+        """Return what of the whole excess the data win back where what is off shrinks from before to after."""
+        lost = [float(off @ self.information @ off) for off in (before, after, self.delta)]
+        return (lost[0] - lost[1]) / max(lost[2], 1e-300)
+
+    def alone(self, columns: dict[str, Array], key: str) -> Alone:
+        theta, cov = self.sizes(columns, [key])
+        test = self.log_p(self.evidence(columns, [key]), len(theta))
+        return Alone(theta, cov, test, self.share(self.delta, self.delta - columns[key] @ theta))
 
     def gain(self, columns: dict[str, Array], beside: Sequence[str], key: str) -> float:
         """Return the evidence that a suspect adds to others."""

@@ -40,14 +40,12 @@ class Told:
 
 def in_words(cause: Cause, about: About) -> Told:
     """Return what is wrong, by how much, and what to do."""
-    base, _, drift = cause.key.partition(" with ")
-    name, c = base.rsplit(" ", 1) if base[-1].isdigit() else (base, "0")
-    k = int(c)
-    unit, scale, say, mend = _SAYINGS[name]
+    name, k, drift = _parts(cause.key)
+    _, _, say, mend = _SAYINGS[name]
+    unit, scale = unit_of(cause.key)
     theta, sigma = cause.theta * scale, np.sqrt(np.diag(cause.cov)) * scale
     size = ", ".join(number(abs(x) if len(theta) == 1 else x, s) for x, s in zip(theta, sigma, strict=True))
-    per = _PER.get(drift, "")
-    said = say(about.cameras[k], about.imu, theta, f"{size} {unit}{per}", bool(drift))
+    said = say(about.cameras[k], about.imu, theta, f"{size} {unit}", bool(drift))
     if name == "distortion":
         off = np.linalg.norm(bending(cause.theta, about, k)[1], axis=1)
         said += f": corners are off by {np.sqrt(np.mean(off**2)):.2g} px rms, {off.max():.2g} px at most, focal length and centre set anew"
@@ -55,15 +53,33 @@ def in_words(cause: Cause, about: About) -> Told:
     then = "" if about.again == "intrinsics" else f", then {about.again}"
     mended = cure.format(camera=about.cameras[k], imu=about.imu, again=about.again, then=then)
     alike = tuple(named(key, about) for key in cause.alike)
-    return Told(said, mended, tuple(theta.tolist()), tuple(sigma.tolist()), f"{unit}{per}", alike)
+    return Told(said, mended, tuple(theta.tolist()), tuple(sigma.tolist()), unit, alike)
 
 
 def named(key: str, about: About) -> str:
     """Return what a suspect is called."""
+    name, c, drift = _parts(key)
+    called = _NAMES[name].format(camera=about.cameras[c], imu=about.imu)
+    return f"{called} with {drift}" if drift else called
+
+
+def unit_of(key: str) -> tuple[str, float]:
+    """Return the unit that a suspect's size is told in, and its worth of one in SI."""
+    name, _, drift = _parts(key)
+    unit, scale, *_ = _SAYINGS[name]
+    return f"{unit}{_PER.get(drift, '')}", scale
+
+
+def base_of(key: str) -> str:
+    """Return the suspect itself of one that goes with time or temperature."""
+    return key.partition(" with ")[0]
+
+
+def _parts(key: str) -> tuple[str, int, str]:
+    """Return name, camera and what it goes with."""
     base, _, drift = key.partition(" with ")
     name, c = base.rsplit(" ", 1) if base[-1].isdigit() else (base, "0")
-    called = _NAMES[name].format(camera=about.cameras[int(c)], imu=about.imu)
-    return f"{called} with {drift}" if drift else called
+    return name, int(c), drift
 
 
 def number(value: float, sigma: float) -> str:

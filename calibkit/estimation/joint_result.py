@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibkit.data.observations import BoardViews
 from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Camera, Estimate, Imu, Reprojection, Rig
 from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
@@ -67,8 +68,7 @@ def joint_result(
             judgement = {"verdict": judged.verdict(name), "reasons": judged.texts(name)}
             rig.imus[name] = rig.imus[name].model_copy(update={"intrinsics": found.model_copy(update=judgement)})
             unknown += [f"{name}.{key}" for key, value in found.parameters.items() if value.status is Status.NOT_OBSERVABLE]
-    of_imus = (each for j, of_imu in enumerate(imus) for each in _imu_sets(joint, of_imu.name, j))
-    residuals = [*(_corner_set(joint, cameras[c], c) for c in range(len(names))), *of_imus]
+    residuals = residual_sets(joint, [each.views for each in cameras], [each.name for each in imus])
     return Result(
         stage=STAGE,
         rig=rig,
@@ -161,7 +161,13 @@ def _rms(px: Array) -> float:
     return float(np.sqrt(np.sum(px**2) / max(len(px), 1)))
 
 
-def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
+def residual_sets(joint: Joint, cameras: Sequence[BoardViews], imus: Sequence[str]) -> list[ResidualSet]:
+    """Return the residuals at the joint's state, of the cameras with their views and of the IMUs with their names."""
+    of_cameras = [_corner_set(joint, views, c) for c, views in enumerate(cameras)]
+    return [*of_cameras, *(each for j, name in enumerate(imus) for each in _imu_sets(joint, name, j))]
+
+
+def _corner_set(joint: Joint, each: BoardViews, c: int) -> ResidualSet:
     """Return every corner's residual with the rate of turn and where the board was."""
     fit, frames = joint.fit, joint.fit.problem.cameras[c]
     px, valid = corner_residuals(fit.problem, fit.x, c)
@@ -172,9 +178,9 @@ def _corner_set(joint: Joint, each: CameraInput, c: int) -> ResidualSet:
     weight = frames.views.weight[frame, corner]
     usual = float(np.median(weight[weight > 0])) if np.any(weight > 0) else 1.0
     return ResidualSet(
-        sensor=each.views.camera,
+        sensor=each.camera,
         unit="px",
-        t_ns=each.views.t_ns[joint.frames[c]][frame],
+        t_ns=each.t_ns[joint.frames[c]][frame],
         raw=np.where(valid[..., None], px, np.nan)[frame, corner],
         sigma=1 / np.where(weight > 0, weight, usual),
         context={

@@ -24,6 +24,7 @@ from calibkit.report.joint_figures import biases, imu_fit, way, whiteness
 from calibkit.report.look import ACCENT, INK, PALE
 from calibkit.report.rotation_figures import rates, residual_rate
 from calibkit.report.signals import frame_tilts
+from calibkit.report.time_figures import over_time
 from calibkit.report.time_offset_figures import offset_over_time, v_curve
 from calibkit.report.view import View, given
 
@@ -41,8 +42,19 @@ STYLE: dict[Any, Any] = {
 
 
 @dataclass(frozen=True)
+class Plate:
+    """A picture that knows what it shows."""
+
+    key: str
+    title: str
+    caption: str
+    height: float  # inches
+    draw: Callable[[Figure], None]
+
+
+@dataclass(frozen=True)
 class Picture:
-    """One kind of picture."""
+    """One kind of picture of a view."""
 
     key: str
     title: str
@@ -51,13 +63,24 @@ class Picture:
     height: float  # inches
     draw: Callable[[Figure, View], None]
 
+    def of(self, view: View) -> Plate:
+        return Plate(self.key, self.title, self.caption, self.height, lambda figure: self.draw(figure, view))
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """Pictures under one heading."""
+
+    name: str
+    plates: tuple[Plate, ...]
+    note: str = ""
+
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture of one view."""
+    """A picture, drawn."""
 
-    picture: Picture
-    view: View
+    plate: Plate
     svg: bytes
     files: Mapping[str, bytes]  # by format
 
@@ -69,14 +92,19 @@ FORMATS: dict[str, dict[str, str | None]] = {  # and what keeps the time of the 
 }
 
 
-def draw(view: View, formats: Sequence[str] = ()) -> list[Drawn]:
-    """Return every picture that the view has the data for, in the table's order; the same view gives the same bytes."""
-    return [_render(picture, view, formats) for picture in PICTURES if view.has(picture.needs)]
+def plates(view: View) -> list[Plate]:
+    """Return every picture that the view has the data for, in the table's order."""
+    return [picture.of(view) for picture in PICTURES if view.has(picture.needs)]
 
 
-def _render(picture: Picture, view: View, formats: Sequence[str]) -> Drawn:
-    files = rendered(picture.height, lambda figure: picture.draw(figure, view), ("svg", *formats))
-    return Drawn(picture, view, files["svg"], {form: files[form] for form in formats})
+def draw(shown: Sequence[Plate], formats: Sequence[str] = ()) -> list[Drawn]:
+    """Return the plates drawn; the same data give the same bytes."""
+    return [_render(plate, formats) for plate in shown]
+
+
+def _render(plate: Plate, formats: Sequence[str]) -> Drawn:
+    files = rendered(plate.height, plate.draw, ("svg", *formats))
+    return Drawn(plate, files["svg"], {form: files[form] for form in formats})
 
 
 def rendered(height: float, draw: Callable[[Figure], None], formats: Sequence[str]) -> dict[str, bytes]:
@@ -224,6 +252,10 @@ PICTURES = (
             "About one height from frame to frame is good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or "
             "mount that drifts.",
             _PIXELS | {"frame"}, 2.6, _frames),
+    Picture("over_time", "Residuals over time",
+            "Level lines around zero are good; a frame's rms that grows, or means that creep, is a mount, a lens or a clock that drifts: "
+            "outwards alone is the focal length.",
+            _PIXELS | {"frame", "centre", "moments"}, 3.8, over_time),
     Picture("allan", "Allan deviation",
             "Points on the line, within their band, are good: the noise is white (falling), flicker (flat) and a random walk (rising); "
             "dotted: their slopes. A bump is something else: vibration, temperature, a filter.",

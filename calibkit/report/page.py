@@ -4,6 +4,7 @@ import base64
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -11,37 +12,61 @@ from markupsafe import Markup
 
 from calibkit.data.rig import CONVENTIONS
 from calibkit.errors import one_line
-from calibkit.report.figures import PICTURES, Picture, draw
+from calibkit.report.figures import PICTURES, Chapter, Drawn, Plate, draw, plates
 from calibkit.report.markdown import MEANING, markdown
 from calibkit.report.parameters import sigma_note
 from calibkit.report.summary import Summary, about, as_json, camera_lines, limit_cells, stage_lines, stage_tables
-from calibkit.report.view import View
 from calibkit.version import __version__
 
+_EARLIER = "A later stage has found this anew: the numbers above are that one's."
+_LONG = 30  # letters of a cell: a column of words, not of numbers
 _SAFE = " !$'*+,-./:;=?@[\\]^_`{|}~"  # quote adds letters and digits
 
 
-def build(summary: Summary, formats: Sequence[str] = ("png",)) -> dict[str, bytes]:
-    """Return the report's files by name: report.html, report.md, report.json and the pictures in these formats (FORMATS)."""
-    sections: dict[str, tuple[View, list[tuple[Picture, Markup]]]] = {}  # a sensor's sets under one heading
+@dataclass(frozen=True)
+class _Section:
+    """Pictures under one heading."""
+
+    name: str
+    note: str
+    pictures: list[tuple[Plate, Markup]]
+
+
+def build(summary: Summary, formats: Sequence[str] = ("png",), chapters: Sequence[Chapter] = ()) -> dict[str, bytes]:
+    """Return the report's files by name: report.html, report.md, report.json and the pictures in these formats (FORMATS).
+
+    Chapters come before the pictures of the views.
+    """
+    sections: dict[str, _Section] = {}  # a sensor's sets under one heading
+    order = {picture.key: i for i, picture in enumerate(PICTURES)}
     images, pictures = {}, []
-    for view in (*summary.views, *summary.earlier):
-        drawn = draw(view, formats)
+
+    def add(heading: str, note: str, parts: tuple[str, ...], drawn: Sequence[Drawn]) -> None:
         for one in drawn:
-            what = {"sensor": view.sensor, "stage": view.stage, "key": one.picture.key, "caption": one.picture.caption}
+            what = {"sensor": parts[0], "stage": parts[-1], "key": one.plate.key, "caption": one.plate.caption}
             for form, content in one.files.items():
-                name = f"pictures/{_slug(view.sensor, view.stage, one.picture.key)}.{form}"
+                name = f"pictures/{_slug(*parts, one.plate.key)}.{form}"
                 images[name] = content
                 pictures.append({"file": name, **what})
-        sections.setdefault(view.name, (view, []))[1].extend((one.picture, _svg_uri(one.svg)) for one in drawn)
+        section = sections.setdefault(heading, _Section(heading, note, []))
+        section.pictures.extend((one.plate, _svg_uri(one.svg)) for one in drawn)
+
+    for chapter in chapters:
+        add(chapter.name, chapter.note, (chapter.name,), draw(chapter.plates, formats))
+    for view in (*summary.views, *summary.earlier):
+        add(view.name, _EARLIER if view in summary.earlier else "", (view.sensor, view.stage), draw(plates(view), formats))
+    for section in sections.values():
+        section.pictures.sort(key=lambda pair: order.get(pair[0].key, -1))  # of a sensor's several sets
     thumbnails = [(result.stage, one.label, _data_uri("image/jpeg", one.jpeg)) for result in summary.results for one in result.thumbnails]
     page = _template().render(
         summary=summary,
         told=[*camera_lines(summary), *stage_lines(summary)],
-        tables=stage_tables(summary),
+        tables=[
+            (table, [i == 0 or max(len(row[i]) for row in table) > _LONG for i in range(len(table[0]))]) for table in stage_tables(summary)
+        ],
         limits=limit_cells(summary),
         meaning=MEANING[summary.verdict],
-        sections=[(view, sorted(drawn, key=lambda pair: PICTURES.index(pair[0]))) for view, drawn in sections.values()],
+        sections=list(sections.values()),
         thumbnails=thumbnails,
         conventions=CONVENTIONS,
         about=about(summary),

@@ -86,6 +86,7 @@ class View:
     measured: Array | None = None  # (n, 3) what raw is left of
     bias: Array | None = None  # (n, 6) rad/s, m/s^2 of an IMU at `place`
     bias_sigma: Array | None = None  # (n, 6)
+    temperature: Array | None = None  # (n,) deg C
     hand_eye: HandEye | None = None  # the transform that these residuals are of
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
@@ -96,6 +97,11 @@ class View:
     def has(self, needs: frozenset[str]) -> bool:
         """Whether something was kept and everything that `needs` names was recorded."""
         return bool(self.kept.any()) and all(getattr(self, need) is not None for need in needs)
+
+    @property
+    def moments(self) -> Array | None:
+        """The times of frames that have stamps: t, where it is not one for all."""
+        return self.t if self.t is not None and len(self.t) and np.ptp(self.t) > 0 else None
 
     @cached_property
     def frame_rms(self) -> Array:
@@ -195,6 +201,7 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         attitude=floats("attitude", 3),
         t=_seconds(result, residuals)[good],
         zeroed=_zero(result, residuals.sensor) is not None,
+        temperature=partly("temperature"),
         rate=partly("rate"),
         rate_before=partly("rate_before"),
         of_rate=partly("of_rate"),

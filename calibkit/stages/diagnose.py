@@ -11,7 +11,7 @@ from calibkit.data.observations import Times
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Camera, Rig
 from calibkit.errors import BadInputError, NotConvergedError
-from calibkit.estimation.diagnosis import FAMILY_WISE, Diagnosis, diagnose
+from calibkit.estimation.diagnosis import FAMILY_WISE, Cause, Diagnosis, Suspect, diagnose
 from calibkit.estimation.diagnosis_words import About, Told, in_words, named
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_known import known_calibration
@@ -142,13 +142,15 @@ class Examined:
     joint: Joint
     held: JointState  # the calibration under test with the trajectory that suits it best
     diagnosed: Diagnosed
+    rig: Rig
+    about: About
+    suspects: tuple[Suspect, ...]
+    drifts: tuple[Drift, ...]
+    temperature: tuple[Array, Array] | None  # s of the recording, deg C
 
-
-def run_diagnosis(
-    sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent
-) -> Diagnosed:
-    """Test a rig file's cameras and IMU against a recording before a board, as `examine` does."""
-    return examine(sources, target, rig, options, progress).diagnosed
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        return self.diagnosed.diagnosis.causes
 
 
 def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent) -> Examined:
@@ -189,7 +191,12 @@ def examine(sources: Sequence[Path], target: Path, rig: Rig, options: Options | 
         rms,
         tuple(read.warnings),
     )
-    return Examined(read, known, joint, held, diagnosed)
+    measured = None if temperature is None else (_seconds(joint, temperature[0]), temperature[1])
+    return Examined(read, known, joint, held, diagnosed, rig, about, suspects, tuple(drifts), measured)
+
+
+def _seconds(joint: Joint, t_ns: Times) -> Array:
+    return np.asarray((t_ns - joint.origin_ns) * 1e-9, np.float64)
 
 
 def _ramp(joint: Joint) -> tuple[Array, Array]:
@@ -202,7 +209,7 @@ def _of_temperature(joint: Joint, path: Path | None, read: tuple[Times, Array] |
     if path is None or read is None:
         return []
     t_ns, celsius = read
-    t = np.asarray((t_ns - joint.origin_ns) * 1e-9, np.float64)
+    t = _seconds(joint, t_ns)
     first, last = joint.fit.problem.imu.t[[0, -1]]
     if t[-1] < first or t[0] > last:
         raise BadInputError(f"{path.name}: its times lie outside of the recording; they must be on the IMU's clock")

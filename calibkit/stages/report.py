@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig, StageRun
@@ -13,6 +14,9 @@ from calibkit.io.rig_file import load_rig
 from calibkit.report.junit import junit
 from calibkit.report.markdown import markdown
 from calibkit.report.summary import NOTHING, Demands, Summary, as_json, summarise
+
+if TYPE_CHECKING:
+    from calibkit.report.figures import Chapter
 
 FILES = ("report.html", "report.json", "report.md")
 
@@ -50,7 +54,7 @@ def report(rig_path: Path, files: Files = NONE, demands: Demands = NOTHING, stri
     results, earlier = _current([load_result(rig_path, rig, run) for run in _latest_runs(rig)], rig_path)
     summary = summarise(rig, results, earlier, demands)
     if files.folder is not None:
-        _write_pages(summary, files.folder, files.pictures)
+        write_pages(summary, files.folder, files.pictures)
     if files.markdown is not None:
         write_atomic(files.markdown, markdown(summary), files.force)
     if files.junit is not None:
@@ -64,7 +68,7 @@ def write_report(result: Result, out_dir: Path, force: bool = False) -> Summary:
     """Write the report of one stage's result: for every stage's `--report DIR`."""
     check_out_dir(out_dir, force)
     summary = summarise(result.rig, [result])
-    _write_pages(summary, out_dir)
+    write_pages(summary, out_dir)
     return summary
 
 
@@ -113,10 +117,11 @@ def _without(result: Result, parts: set[str]) -> Result:
     )
 
 
-def _write_pages(summary: Summary, out_dir: Path, formats: Sequence[str] = Files.pictures) -> None:
+def write_pages(summary: Summary, out_dir: Path, formats: Sequence[str] = Files.pictures, chapters: Sequence["Chapter"] = ()) -> None:
+    """Write the report's files; pictures beside those of the residuals come from `chapters`."""
     from calibkit.report.page import build  # matplotlib and jinja2: not needed where only the verdict is asked for
 
-    for name, content in build(summary, formats).items():
+    for name, content in build(summary, formats, chapters).items():
         path = out_dir / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -8,14 +8,14 @@ import numpy as np
 
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
-from calibkit.estimation.joint_checks import Checks, check_joint
+from calibkit.estimation.joint_checks import Checks, Halves, check_joint
 from calibkit.estimation.joint_suspects import left_by_sensor
 from calibkit.estimation.speed_sweep import Sweep, sweep
 from calibkit.geometry.spline import Steps, basis, turning
 from calibkit.report.columns import columns
 from calibkit.stages.diagnose import Diagnosed, Examined, Options, examine, sensors_of
 
-_APART = 4.5  # sigmas of halves, of gravity and of the board's size
+APART = 4.5  # sigmas of halves, of gravity and of the board's size
 _SCALE_OFF = 0.004  # of the board's size
 _GROWS = 5.0  # sigmas of a slope with the rate
 _MUCH = 1.5  # rms at the fastest turns over that at rest
@@ -34,9 +34,14 @@ class Line:
 class Validated:
     """What was found."""
 
-    diagnosed: Diagnosed
     lines: tuple[Line, ...]
     sweeps: dict[str, tuple[Sweep, str]]  # by sensor, with the unit of its residuals
+    halves: Halves | None
+    examined: Examined
+
+    @property
+    def diagnosed(self) -> Diagnosed:
+        return self.examined.diagnosed
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -99,7 +104,8 @@ def validate(sources: Sequence[Path], target: Path, rig: Rig, options: Options |
     """
     found = examine(sources, target, rig, options, progress)
     checks = check_joint(found.joint.fit)
-    return Validated(found.diagnosed, _lines(found, checks), _sweeps(found))
+    sweeps = _sweeps(found)
+    return Validated(_lines(found, checks, sweeps), sweeps, checks.halves, found)
 
 
 def _sweeps(found: Examined) -> dict[str, tuple[Sweep, str]]:
@@ -115,19 +121,19 @@ def _sweeps(found: Examined) -> dict[str, tuple[Sweep, str]]:
     return out
 
 
-def _lines(found: Examined, checks: Checks) -> tuple[Line, ...]:
+def _lines(found: Examined, checks: Checks, sweeps: dict[str, tuple[Sweep, str]]) -> tuple[Line, ...]:
     fit, lines = found.joint.fit, []
     if checks.halves is not None:
         worst = float(np.abs(checks.halves.z).max())
-        lines.append(Line("repeatability", f"each half by itself gives the same within {worst:.1f} sigma", worst < _APART))
+        lines.append(Line("repeatability", f"each half by itself gives the same within {worst:.1f} sigma", worst < APART))
     size, prior = float(np.linalg.norm(fit.x.gravity)), fit.problem.gravity
     lines.append(
-        Line("gravity", f"{size:.4f} m/s^2 of {prior.size:.4f} +- {prior.sigma:.2g}", abs(size - prior.size) < _APART * prior.sigma)
+        Line("gravity", f"{size:.4f} m/s^2 of {prior.size:.4f} +- {prior.sigma:.2g}", abs(size - prior.size) < APART * prior.sigma)
     )
     scale, sigma = checks.board_scale
-    good = abs(scale - 1) < max(_SCALE_OFF, _APART * sigma)
+    good = abs(scale - 1) < max(_SCALE_OFF, APART * sigma)
     lines.append(Line("board", f"{scale:.4f} +- {sigma:.2g} times the size that its file says, by the accelerometer", good))
-    for name, (each, unit) in _sweeps(found).items():
+    for name, (each, unit) in sweeps.items():
         fast = float(each.rms[-1] / max(each.at_rest, 1e-300))
         grows = each.slope > _GROWS * each.slope_sigma and fast > _MUCH
         lines.append(

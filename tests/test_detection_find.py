@@ -2,9 +2,12 @@
 
 import multiprocessing
 import sqlite3
+import subprocess
+import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibkit.data.observations import BoardViews, ImageFrame
 from calibkit.data.progress import silent
-from calibkit.detection import crew, find, sequence
+from calibkit.detection import crew, sequence
 from calibkit.detection.cache import CornerCache
 from calibkit.detection.find import find_boards
 from calibkit.detection.found import NOTHING, Detection, Tags
@@ -121,6 +124,67 @@ def test_few_frames_wait_and_an_interrupt_stops_at_once(images: list[NDArray[np.
     assert taken <= 5 + UNDER_WAY
     assert looked <= taken
     assert threading.active_count() == alive
+
+
+def decoded(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image
+
+
+def decoded_here_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if multiprocessing.parent_process() is not None:
+        crew.os._exit(1)
+    return image
+
+
+def many(images: list[NDArray[np.uint8]], decode: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> list[ImageFrame]:
+    return [ImageFrame(k, f"im_{k}.png", image.tobytes(), partial(decode, image)) for k, image in enumerate(images * 8)]
+
+
+def test_processes_find_what_threads_find(images: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew.os, "cpu_count", lambda: 2)
+    broken = ImageFrame(7, "bad.png", b"x", undecodable)
+    asked = [broken, *many(images, decoded)]
+    by_threads = find_boards(asked, BOARD, "cam0", None, silent)
+    monkeypatch.setattr(crew, "_MANY", 20)
+    monkeypatch.setattr(crew, "look_through", lambda *_: pytest.fail("no process was asked"))
+    assert same(find_boards(asked, BOARD, "cam0", None, silent, len(asked)), by_threads)
+
+
+@pytest.mark.slow
+def test_processes_that_end_are_done_without(images: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew.os, "cpu_count", lambda: 2)
+    asked = many(images, decoded)
+    by_threads = find_boards(asked, BOARD, "cam0", None, silent)
+    asked = many(images, decoded_here_only)
+    assert same(find_boards(asked, BOARD, "cam0", None, silent, 200), by_threads)
+
+
+@pytest.mark.slow
+def test_images_that_cannot_be_handed_over_stay_here(images: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew.os, "cpu_count", lambda: 2)
+    assert find_boards(frames(images), BOARD, "cam0", None, silent, 200).n_frames == len(images)
+
+
+SCRIPT = """
+print("once")
+import numpy as np
+from functools import partial
+from calibkit.data.observations import ImageFrame
+from calibkit.data.progress import silent
+from calibkit.detection import crew
+from calibkit.detection.find import find_boards
+from calibkit.models.board import AprilGrid
+crew.os.cpu_count = lambda: 2
+frames = [ImageFrame(k, str(k), b"", partial(np.full, (240, 320), k, np.uint8)) for k in range(120)]
+print(find_boards(frames, AprilGrid(4, 3, 0.088, 0.3), "cam0", None, silent, 120).n_images)
+"""
+
+
+@pytest.mark.slow
+def test_processes_do_not_run_the_callers_script(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert (ran.stdout, ran.stderr) == ("once\n120\n", "")
 
 
 def test_second_run_decodes_nothing(images: list[NDArray[np.uint8]], tmp_path: Path) -> None:

@@ -26,9 +26,21 @@ _REACH = 1.0  # tag sides over which neighbours tell how a lens bends
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
 _STARTS = 8  # seeds whose homographies are tried: enough that some are right
-_RIM = 0.1  # tag sides out of view that are tried once more: where the first try found two corners, the others are known better
 _KEPT = 0.7  # of the tags foretold, where a board is followed
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How hard tags are sought from others."""
+
+    reaches: tuple[float, ...]  # steps from known tags: the second leaps over those that are hidden
+    tries: tuple[tuple[float, float], ...]  # saddle window, and how far out of view a tag may be foretold, in tag sides
+
+
+# A second try knows more: the corners that the first one found towards the known tags foretell the others
+_SEARCH = _Effort((1.5, 2.9), ((_NARROW, _AGREE), (_NARROW, 0.1), (_WIDE, 0.1)))
+_FOLLOW = _Effort((1.5,), ((_NARROW, 0.1), (_WIDE, 0.1)))
 
 
 def detect(image: Image, board: AprilGrid) -> Detection:
@@ -61,7 +73,7 @@ def follow(image: Image, board: AprilGrid, corner: NDArray[np.int32], uv: Array)
     seed, seen = _read(smoothed, tags, corners)
     if seen.sum() < max(2, _KEPT * len(tags)):
         return None
-    uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed[: len(xy)], np.flatnonzero(seen))
+    uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed[: len(xy)], np.flatnonzero(seen), _FOLLOW)
     return replace(_finish(smoothed, xy, board.spacing, uv, fitted), tags=Tags(int(seen.sum())))
 
 
@@ -73,7 +85,7 @@ def _from_seeds(image: Smoothed, board: AprilGrid, tags: NDArray[np.int32], corn
     first = np.flatnonzero(seen)
     if len(first) >= 2:
         first = first[_largest_agreement(xy[first], seed[first])]
-    uv, fitted = _grow(image, xy, 1 + board.spacing, seed, first)
+    uv, fitted = _grow(image, xy, 1 + board.spacing, seed, first, _SEARCH)
     known = fitted.any(1)
     if known.sum() >= 2:
         counts = Tags(int(seen.sum()), int((seen & ~known).sum()), foreign)
@@ -140,7 +152,7 @@ def _inside(image: Image | Smoothed, corners: Array) -> Mask:
     return np.asarray(((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1))
 
 
-def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[np.intp]) -> tuple[Array, Mask]:
+def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[np.intp], effort: _Effort) -> tuple[Array, Mask]:
     """Return the corners uv (t, 4, 2) of all tags that the seeds of the `first` (k,) lead to, and which (t, 4) were fitted.
 
     Each tag next to known ones starts from its seed where that is near the place foretold, else from there.
@@ -151,11 +163,11 @@ def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[n
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
     known: Mask = np.asarray(fitted.any(1))
     asked = known.copy()
-    for reach in (1.5, 2.9):  # the second leaps over tags that are hidden
+    for reach in effort.reaches:
         neighbour = apart < reach
         ask = np.flatnonzero(~asked & neighbour[:, known].any(1))
         while len(ask):
-            tried = _try(image, xy, step, uv, fitted, seed, ask)
+            tried = _try(image, xy, step, uv, fitted, seed, ask, effort)
             asked[ask] = True
             found = ask[tried.good]
             uv[found], fitted[found] = tried.corners[tried.good], tried.ok[tried.good]
@@ -173,13 +185,13 @@ class _Tried:
     good: Mask  # (m,) three saddles or more and the code
 
 
-def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp]) -> _Tried:
+def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp], effort: _Effort) -> _Tried:
     """Look for the tags `ask` (m,). Where only the corners towards the known tags are found, they help to foretell the others once more."""
     uv, fitted = uv.copy(), fitted.copy()
     m = len(ask)
     out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool))
     todo = np.arange(m)
-    for window, beyond in ((_NARROW, _AGREE), (_NARROW, _RIM), (_WIDE, _RIM)):
+    for window, beyond in effort.tries:
         start = predict(xy[fitted], uv[fitted], xy[ask[todo]], step)
         seeds, slack = seed[ask[todo]], _AGREE * _sides(start)
         near = np.linalg.norm(seeds - start, axis=-1).max(1) < slack  # NaN is not

@@ -37,14 +37,19 @@ def smooth(image: Image) -> Smoothed:
 
 
 def sample(image: Smoothed, uv: Array) -> Smoothed:
-    """Return the image's values (...) at pixels (..., 2), bilinear, the border repeated.
+    """Return the image's values (n,) or (n, m) at pixels (n, 2) or (n, m, 2), rounded to 1/32 px, bilinear, the border repeated."""
+    u, v = np.moveaxis(uv, -1, 0)
+    return _near(image, u, v) if u.ndim == 2 else _near(image, u[:, None], v[:, None])[:, 0]
 
-    Not cv2.remap: that one rounds to 1/32 px.
-    """
-    return _at(image, uv[..., 0], uv[..., 1])
+
+def _near(image: Smoothed, u: Array, v: Array) -> Smoothed:
+    if not u.size:
+        return np.zeros(u.shape, np.float32)
+    return np.asarray(cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _at(image: Smoothed, u: Array, v: Array) -> Smoothed:
+    """Return what `_near` does at places that are not rounded."""
     h, w = image.shape
     x, y = np.minimum(np.maximum(u, 0), w - 1.001), np.minimum(np.maximum(v, 0), h - 1.001)
     column, row = x.astype(np.intp), y.astype(np.intp)
@@ -99,7 +104,7 @@ def saddle(image: Smoothed, uv: Array, J: Array, bright: Array | float = 0.0, it
     for k in range(iterations):
         window = np.maximum(size * _SHRINK**k, smallest)[:, None, None] * J
         u, v = (uv[:, axis, None] + window[:, axis] @ _WINDOW.T for axis in (0, 1))
-        _, gx, gy, a, b, c = (_at(image, u, v) @ _QUADRATIC.T).T
+        _, gx, gy, a, b, c = (_near(image, u, v) @ _QUADRATIC.T).T
         det = 4 * a * c - b * b
         found = (det < 0) & (b * bright >= 0)
         det = np.where(found, det, -np.inf)

@@ -23,7 +23,7 @@ from calibkit.opencv import cv2
 BIAS_PX = {AprilGrid.kind: 0.004, Checkerboard.kind: 0.004, Charuco.kind: 0.004, CircleGrid.kind: 0.03}
 _NAMED = 3  # broken images named one by one
 _WRONG_LAYOUT = 0.25  # of the tags in an image: one column too many misplaces four fifths, a right target hardly any
-_SHORT_BATCH, _LONG_BATCH = 4, 20  # consecutive images that are looked through together
+_SHORT_BATCH, _LONG_BATCH = 4, 30  # consecutive images that are looked through together
 _SOME = 32  # images in short batches, so that a few are shared out evenly
 _BATCH_BYTES = 32 * 2**20  # as stored
 _STRAY = 0.05  # of all tags, worth a warning

@@ -121,10 +121,17 @@ def _neighbours(points: bytes, reach: float) -> _Neighbours:
     normal = weighted @ np.swapaxes(terms, 1, 2)
     units = np.repeat(1 / reach ** np.arange(1, 3), [2, 3])[:, None]
     # A wrong corner at the board's rim would bend a cubic to itself: whether it belongs is asked of the first six terms
-    first = np.linalg.inv(normal[:, :6, :6] + _STIFF[:6, :6])[:, :1]
+    first = _columns(normal[:, :6, :6] + _STIFF[:6, :6], slice(0, 1))
     leverage = np.minimum(first[:, 0, 0], 1 - 1e-6)  # a corner's weight in its own map is 1, its terms are 1, 0, 0, ...
-    gain = np.concatenate([units * (np.linalg.inv(normal + _STIFF)[:, 1:6] @ weighted), first @ weighted[:, :6]], axis=1)
+    gain = np.concatenate([units * (_columns(normal + _STIFF, slice(1, 6)) @ weighted), first @ weighted[:, :6]], axis=1)
     return _Neighbours(near, gain, 1 / np.sqrt(1 - leverage))
+
+
+def _columns(matrix: Array, which: slice) -> Array:
+    """Return some columns (n, c, k) of the inverses of symmetric matrices (n, k, k)."""
+    k = matrix.shape[-1]
+    some = np.eye(k)[:, which]
+    return np.swapaxes(np.linalg.solve(matrix, np.broadcast_to(some, (len(matrix), *some.shape))), 1, 2)
 
 
 def _nearest(xy: Array, k: int) -> NDArray[np.intp]:

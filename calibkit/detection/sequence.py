@@ -23,7 +23,7 @@ FOLLOWERS: dict[str, Callable[[Image, Any, NDArray[np.int32], Array], Detection 
 _SIZE = 376  # px, long side of the images in which the flow is sought: it need not be exact
 _WINDOW, _LEVELS = (11, 11), 3  # finds motions up to some 100 px of 752
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
-_POINTS = 36  # at most, that the flow follows
+_POINTS = 24  # at most, that the flow follows
 _FEWEST = 8  # of them that agree
 _AGREE_PX = 3.0  # with one homography, in the image's own px
 _PATIENCE = 2  # searches in vain for a board that flow foretold: these images are no video

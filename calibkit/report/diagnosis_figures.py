@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibkit.report.field import cells, grid
-from calibkit.report.figures import image_axes, round_down
 from calibkit.report.look import ACCENT, INK, PALE
+from calibkit.report.over_images import image_axes, round_down
 from calibkit.report.view import Array
 
 _BINS, _FEWEST = 14, 25

@@ -8,12 +8,10 @@ import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import floor, log10
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -21,7 +19,9 @@ from calibkit.report.field import cells, grid, over_image, over_radius
 from calibkit.report.hand_eye_figures import cross_sections, pose_residuals, poses_in_space, rotation_axes
 from calibkit.report.imu_figures import allan, stands
 from calibkit.report.joint_figures import biases, imu_fit, way, whiteness
+from calibkit.report.lens_uncertainty import uncertainty
 from calibkit.report.look import ACCENT, INK, PALE
+from calibkit.report.over_images import image_axes, round_down
 from calibkit.report.rotation_figures import rates, residual_rate
 from calibkit.report.signals import frame_tilts
 from calibkit.report.time_figures import over_time
@@ -221,19 +221,6 @@ def _frames(figure: Figure, view: View) -> None:
     axes.set_title(textwrap.fill(f"median {middle:.3g} {view.unit} (dashed); worst: {named}", 105))
 
 
-def image_axes(axes: Axes, size: tuple[int, int]) -> None:
-    """Make the axes those of an image of width, height px."""
-    width, height = size
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u (px)", ylabel="v (px)")
-    axes.spines[:].set_visible(True)
-
-
-def round_down(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above value."""
-    power = 10.0 ** floor(log10(value))
-    return max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-12))
-
-
 _PIXELS = frozenset({"uv"})
 _IMAGE = frozenset({"uv", "frame", "image_size", "centre"})
 PICTURES = (
@@ -252,6 +239,10 @@ PICTURES = (
             "About one height from frame to frame is good; a frame that stands out is blurred or holds a wrong board, a slope is a lens or "
             "mount that drifts.",
             _PIXELS | {"frame"}, 2.6, _frames),
+    Picture("uncertainty", "How well a point's pixel is known",
+            "By the lens's covariance; what a turn and a shift of the camera make up for over the corners that were seen (dots) is taken "
+            "out. Small and even is good; where it climbs, no board was: bring it there, and to the distances of use.",
+            _IMAGE | {"lens", "distance"}, 3.2, uncertainty),
     Picture("over_time", "Residuals over time",
             "Level lines around zero are good; a frame's rms that grows, or means that creep, is a mount, a lens or a clock that drifts: "
             "outwards alone is the focal length.",

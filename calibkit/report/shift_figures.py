@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibkit.report.figures import image_axes, rendered, round_down
+from calibkit.report.figures import rendered
 from calibkit.report.look import ACCENT, INK
+from calibkit.report.over_images import image_axes, round_down
 from calibkit.report.view import Array
 
 _COLUMNS = 24  # of arrows

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.data.result import ResidualSet, Result
-from calibkit.data.rig import ImuAxis, Noise
+from calibkit.data.rig import Camera, ImuAxis, Noise
 from calibkit.errors import one_line
+from calibkit.models.cameras import CAMERAS, CameraModel
 from calibkit.report.hand_eye_view import HandEye, hand_eye_of
 
 Array = NDArray[np.float64]
@@ -39,6 +40,15 @@ class ClockLine:
 
     skew: float | None  # s/s; None: no drift to speak of
     jumps: tuple[tuple[float, float], ...]  # when, s since the stage's zero, and by how much, s
+
+
+@dataclass(frozen=True)
+class KnownLens:
+    """A lens with what is known of it."""
+
+    model: CameraModel
+    params: Array  # (p,)
+    cov: Array  # (p, p)
 
 
 @dataclass(frozen=True)
@@ -87,6 +97,8 @@ class View:
     bias: Array | None = None  # (n, 6) rad/s, m/s^2 of an IMU at `place`
     bias_sigma: Array | None = None  # (n, 6)
     temperature: Array | None = None  # (n,) deg C
+    distance: Array | None = None  # (n,) m of a corner from the camera; NaN where unknown
+    lens: KnownLens | None = None  # None: a number or the covariance is not known
     hand_eye: HandEye | None = None  # the transform that these residuals are of
     n_lost: int = 0  # rows that have no prediction (behind the camera, outside the model's domain)
 
@@ -202,6 +214,8 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         t=_seconds(result, residuals)[good],
         zeroed=_zero(result, residuals.sensor) is not None,
         temperature=partly("temperature"),
+        distance=partly("distance"),
+        lens=_lens(camera),
         rate=partly("rate"),
         rate_before=partly("rate_before"),
         of_rate=partly("of_rate"),
@@ -222,6 +236,17 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         bias_sigma=floats("bias_sigma", 6),
         hand_eye=hand_eye_of(result, residuals.sensor),
     )
+
+
+def _lens(camera: Camera | None) -> KnownLens | None:
+    if camera is None or camera.covariance is None:
+        return None
+    model = CAMERAS[camera.model]
+    values = [camera.parameters[name].value for name in model.parameter_names]
+    if None in values or set(camera.covariance.order) != set(model.parameter_names):
+        return None
+    at = [camera.covariance.order.index(name) for name in model.parameter_names]
+    return KnownLens(model, np.array(values, float), np.array(camera.covariance.matrix, float)[np.ix_(at, at)])
 
 
 def _seconds(result: Result, residuals: ResidualSet) -> Array:

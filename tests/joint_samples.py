@@ -8,6 +8,7 @@ from time_offset_samples import camera_session, lens
 
 from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.result import Result
+from calibkit.estimation.added_motion import missing_motions
 from calibkit.estimation.joint import BesideInput, CameraInput, ImuNoise, Joint, Settings, calibrate_joint
 from calibkit.estimation.joint_checks import check_joint
 from calibkit.estimation.joint_imu import ImuInput, NamedImu
@@ -48,7 +49,7 @@ class Recording:
         imus = [NamedImu("imu0", imu or ImuInput(self.imu)), *(NamedImu(f"imu{j}", ImuInput(each)) for j, each in enumerate(beside, 1))]
         stamps = {each.name: check_stamps(each.input.samples.t_ns, "sample") for each in imus}
         stamps["cam0"] = check_stamps(self.views.t_ns, "frame")
-        return joint_result(joint, trust, checks, [self.camera], imus, stamps)
+        return joint_result(joint, trust, checks, [self.camera], imus, stamps, missing_motions(joint.fit, trust))
 
 
 def recorded(seed: int, duration_s: float = 30.0, noise_px: float = 0.2, motion: str = "rich", faults: tuple[str, ...] = ()) -> Recording:

@@ -42,6 +42,13 @@ def opened(result: Result) -> list[str]:
     return [reason.text for reason in result.reasons if reason.text.startswith(f"{T}: ") and "is not observable" in reason.text]
 
 
+def to_add(result: Result) -> list[str]:
+    lines = result.facts["lines"]
+    assert isinstance(lines, list)
+    heads = [i for i, line in enumerate(lines) if "to determine all, add, for 10 s each:" in line]
+    return [line.strip() for i in heads for line in lines[i + 1 :]]
+
+
 def translation(recording: Recording, joint: Joint, result: Result) -> None:
     """The lever arm alone: accelerations tell rotation and offset."""
     assert unknown(result) == set(P)
@@ -67,6 +74,8 @@ def planar(recording: Recording, joint: Joint, result: Result) -> None:
     texts = opened(result)
     assert len(texts) == 1
     assert f"p of {T} along the imu0's x axis" in texts[0]
+    assert len(to_add(result)) == 1
+    assert re.match(r"turn it about the camera's [xz] axis .* \(all is determined then\)", to_add(result)[0])  # across its turns
     assert unknown(result) == {"p_y"}
     assert right(recording, joint, slice(3, 7))
 
@@ -141,6 +150,7 @@ def no_alarm(seed: int) -> None:
     result = recording.result(recording.fitted(), halves=True)
     assert result.verdict is Verdict.PASS, [reason.text for reason in result.reasons]
     assert result.exit_code == 0
+    assert not to_add(result)
 
 
 @pytest.mark.parametrize("seed", range(1))

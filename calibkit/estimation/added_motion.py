@@ -4,10 +4,11 @@ The information of a motion does not hang on what is measured, only on where eve
 that of the recording, and the motion is best that leaves the least sigma, in units of what must be known, of the worst parameter.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.joint_fit import JointFit
 from calibkit.estimation.joint_inertial import ImuRows
@@ -35,10 +36,25 @@ class AddedMotion:
 
     text: str
     cov: Array  # (p, p) of the calibration with it, and with those before it
+    left: float  # the worst sigma of T and dt then, in units of what must be known
 
 
 def missing_motions(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
     """Return the motions about and along the first camera's axes to add, the most useful first, until all is determined or none helps."""
+    with threadpool_limits(1, user_api="blas"):
+        return _missing(fit, trust)
+
+
+def in_words(motions: Sequence[AddedMotion]) -> list[str]:
+    """Return each motion with what is known once it is added, too."""
+    known = (
+        "all is determined then" if each.left <= DETERMINED else f"the worst is known to {each.left:.0f} times 1 mm, 1 mrad, 0.1 ms then"
+        for each in motions
+    )
+    return [f"{each.text} ({then})" for each, then in zip(motions, known, strict=True)]
+
+
+def _missing(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
     left = worst(trust.cov, trust.scales, fit)
     if left <= DETERMINED:
         return ()
@@ -48,8 +64,8 @@ def missing_motions(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
         covs = {text: _covariance(known + S, trust) for text, S in told.items()}
         best = min(covs, key=lambda text: worst(covs[text], trust.scales, fit))
         known = known + told.pop(best)
-        found.append(AddedMotion(best, covs[best]))
         before, left = left, worst(covs[best], trust.scales, fit)
+        found.append(AddedMotion(best, covs[best], left))
         if left > _HELPS * before:
             return tuple(found[:-1])
     return tuple(found)
@@ -72,11 +88,10 @@ def _covariance(information: Array, trust: Trust) -> Array:
 
 
 def worst(cov: Array, scales: Array, fit: JointFit) -> float:
-    """Return the greatest sigma of T and dt of all cameras, in units of what they must be known to."""
-    border = fit.problem.border
-    at = [
-        k for c in range(len(fit.problem.cameras)) for name in (f"T {c}", f"dt {c}") for k in range(border[name].start, border[name].stop)
-    ]
+    """Return the greatest sigma of T and dt of all cameras and further IMUs, in units of what they must be known to."""
+    cameras, imus = range(len(fit.problem.cameras)), range(1, len(fit.problem.imus))
+    names = [name for c in cameras for name in (f"T {c}", f"dt {c}")] + [name for j in imus for name in (f"T_imu {j}", f"dt_imu {j}")]
+    at = fit.problem.border.at(names)
     return float(np.max(np.sqrt(np.diag(cov))[at] / scales[at]))
 
 

@@ -11,6 +11,7 @@ from calibkit.data.result import ResidualSet, Result
 from calibkit.data.rig import Camera, Estimate, Imu, Reprojection, Rig
 from calibkit.data.transforms import make_covariance, make_time_offset, make_transform
 from calibkit.data.verdict import Status
+from calibkit.estimation.added_motion import DURATION_S, AddedMotion, in_words
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.joint import CameraInput, Joint
 from calibkit.estimation.joint_checks import Checks
@@ -39,8 +40,12 @@ def joint_result(
     cameras: Sequence[CameraInput],
     imus: Sequence[NamedImu],
     stamps: dict[str, StampReport],
+    motions: Sequence[AddedMotion] = (),
 ) -> Result:
-    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera, T_imu_ref and dt_ref_imu of further IMUs."""
+    """Return the result of stage `joint`: lenses, T_cam_imu and dt_imu_cam of each camera, T_imu_ref and dt_ref_imu of further IMUs.
+
+    `motions` are what the recording lacks.
+    """
     if not _tells_an_offset(joint, trust):  # the motion leaves it open: another solution is no news
         joint = replace(joint, rival=None)
     trust = spread(trust, joint.rival)
@@ -79,7 +84,7 @@ def joint_result(
             "frame_labels": {
                 name: [each.views.labels[i] for i in rows] for name, each, rows in zip(names, cameras, joint.frames, strict=True)
             },
-            "lines": _lines(joint, trust, checks, names, [each.name for each in imus], judged),
+            "lines": _lines(joint, trust, checks, names, [each.name for each in imus], judged) + _to_add(judged, motions),
             "t_zero_ns": dict.fromkeys((each.sensor for each in residuals), joint.origin_ns),
         },
         not_observable=tuple(unknown),
@@ -304,6 +309,12 @@ def _noise_line(joint: Joint, of: str, j: int) -> str:
     sigma, root = joint.fit.problem.imus[j].sigma, np.sqrt(joint.imus[j].rate_hz)
     gyro, accel = f"{sigma[:3].mean() / root:.2e} rad/s/sqrt(Hz)", f"{sigma[3:].mean() / root:.2e} m/s^2/sqrt(Hz)"
     return f"  noise {f'of {of} ' if of else ''}as the residuals have it: gyroscope {gyro}, accelerometer {accel}"
+
+
+def _to_add(judged: Judged, motions: Sequence[AddedMotion]) -> list[str]:
+    if not motions or judged.contradicted:
+        return []
+    return [f"  to determine all, add, for {DURATION_S:.0f} s each:", *(f"    {text}" for text in in_words(motions))]
 
 
 def _corner_sigma(joint: Joint, c: int) -> float:

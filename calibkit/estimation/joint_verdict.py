@@ -48,6 +48,7 @@ class Judged:
     opens: tuple[tuple[Open, ...], ...]  # per camera, of T_cam_imu
     opens_of_imus: tuple[tuple[Open, ...], ...]  # per further IMU, of T_imu_ref
     reasons: dict[str, tuple[Reason, ...]]  # by rig entry, "" what concerns all
+    contradicted: bool = False  # sensors contradict each other: what is open is no lack of motion
 
     @property
     def all(self) -> tuple[Reason, ...]:
@@ -103,7 +104,9 @@ def judge_joint(
         reasons |= {key: _follows(key, each) for key, each in reasons.items() if key not in sensors}
     reasons[""] = _of_all(joint, checks, sensors[len(names) :], any(cause is not None for cause in jitter), wrong)
     reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, sensors))}
-    return Judged(tuple(statuses), tuple(opens), tuple(opens_of_imus), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()})
+    return Judged(
+        tuple(statuses), tuple(opens), tuple(opens_of_imus), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()}, bool(wrong)
+    )
 
 
 def _contradicting(joint: Joint, statuses: Sequence[Status], names: tuple[str, ...], imu: str) -> list[str]:

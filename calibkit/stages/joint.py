@@ -12,6 +12,7 @@ from calibkit.data.observations import BoardViews
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Camera
 from calibkit.errors import one_line
+from calibkit.estimation.added_motion import missing_motions
 from calibkit.estimation.joint import CameraInput
 from calibkit.estimation.joint_checks import check_joint
 from calibkit.estimation.joint_imu import NamedImu
@@ -55,7 +56,7 @@ def joint(
     for each, measured in zip(read.imus, found.imus, strict=True):
         known = each.known if each.name in base.imus else each.known.model_copy(update={"rate_hz": round(measured.rate_hz, 3)})
         imus.append(NamedImu(each.name, each.input, known))
-    result = joint_result(found, trust, checks, cameras, imus, read.stamps)
+    result = joint_result(found, trust, checks, cameras, imus, read.stamps, missing_motions(found.fit, trust))
     result = replace(result, facts={**result.facts, "warnings": read.warnings})
     told: dict[str, str | float | int | bool | None] = {
         "target": read.board.key(),

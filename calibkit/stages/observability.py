@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from threadpoolctl import threadpool_limits
-
 from calibkit.data.progress import Progress, silent
 from calibkit.data.result import Result
 from calibkit.data.rig import Rig
 from calibkit.data.verdict import Reason, Status
-from calibkit.estimation.added_motion import DURATION_S, AddedMotion, missing_motions, worst
+from calibkit.estimation.added_motion import DURATION_S, AddedMotion, in_words, missing_motions
 from calibkit.estimation.joint import CameraInput
 from calibkit.estimation.joint_checks import check_joint
 from calibkit.estimation.joint_imu import NamedImu
@@ -18,7 +16,6 @@ from calibkit.estimation.joint_result import joint_result
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.report.columns import columns
 from calibkit.report.parameters import Row, number, rows
-from calibkit.solver.trust import DETERMINED
 from calibkit.stages.camera_imu import Sensors, read_camera_imu
 
 
@@ -30,7 +27,6 @@ class Observability:
     rows: tuple[Row, ...]
     reasons: tuple[Reason, ...]  # what the recording leaves open, and what else speaks against it
     motions: tuple[AddedMotion, ...]
-    left: tuple[float, ...]  # the worst sigma of T and dt after each motion, in units of what must be known
     warnings: tuple[str, ...]
 
     @property
@@ -48,9 +44,7 @@ class Observability:
         out = [self.what, "", columns(table), ""]
         out += [f"  {reason.verdict.value} {reason.text}" for reason in self.reasons]
         out += ["", f"add, for {DURATION_S:.0f} s each:"] if self.motions else []
-        for motion, left in zip(self.motions, self.left, strict=True):
-            known = "all is determined then" if left <= DETERMINED else f"the worst is known to {left:.0f} times 1 mm, 1 mrad, 0.1 ms then"
-            out.append(f"  {motion.text} ({known})")
+        out += [f"  {text}" for text in in_words(self.motions)]
         return "\n".join([*out, "", self.verdict])
 
     @property
@@ -77,7 +71,7 @@ class Observability:
                 for row in self.rows
             ],
             "reasons": [{"verdict": reason.verdict.value, "text": reason.text} for reason in self.reasons],
-            "add": [{"motion": motion.text, "worst": left} for motion, left in zip(self.motions, self.left, strict=True)],
+            "add": [{"motion": motion.text, "worst": motion.left} for motion in self.motions],
             "warnings": list(self.warnings),
         }
 
@@ -96,14 +90,12 @@ def observability(
     result = joint_result(
         joint, trust, check_joint(joint.fit, halves=False), cameras, [NamedImu(read.imu.name, read.imu.input)], read.stamps
     )
-    with threadpool_limits(1, user_api="blas"):
-        motions = missing_motions(joint.fit, trust)
-    left = tuple(worst(motion.cov, trust.scales, joint.fit) for motion in motions)
+    motions = missing_motions(joint.fit, trust)
     span = joint.fit.problem.imu.t[-1] - joint.fit.problem.imu.t[0]
     frames = ", ".join(f"{len(each.t)} frames of {name}" for each, name in zip(joint.fit.problem.cameras, read.names, strict=True))
     samples = f"{len(joint.fit.problem.imu.t)} samples of {read.imu.name} over {span:.4g} s"
     what = f"{frames}, {samples}; sigmas are those that calibkit joint would have"
-    return Observability(what, tuple(_asked(result)), result.reasons, motions, left, tuple(read.warnings))
+    return Observability(what, tuple(_asked(result)), result.reasons, motions, tuple(read.warnings))
 
 
 def _asked(result: Result) -> list[Row]:

@@ -26,6 +26,7 @@ _REACH = 1.0  # tag sides over which neighbours tell how a lens bends
 _OUT_OF_LINE = 0.05  # tag sides
 _ENOUGH = 8  # corners to predict others from
 _STARTS = 8  # seeds whose homographies are tried: enough that some are right
+_WELL_INSIDE = 0.1  # tag sides from the image's border: a tag foretold there is found, of 2453 in a video but for two
 _KEPT = 0.7  # of the tags foretold, where a board is followed
 _AGREE = 0.35  # tag sides by which a lens may bend the board away from one homography
 
@@ -73,7 +74,9 @@ def follow(image: Image, board: AprilGrid, corner: NDArray[np.int32], uv: Array)
     seed, seen = _read(smoothed, tags, corners)
     if seen.sum() < max(2, _KEPT * len(tags)):
         return None
-    uv, fitted = _grow(smoothed, xy, 1 + board.spacing, seed[: len(xy)], np.flatnonzero(seen), _FOLLOW)
+    uv, fitted, missed = _grow(smoothed, xy, 1 + board.spacing, seed[: len(xy)], np.flatnonzero(seen), _FOLLOW)
+    if missed:
+        return None
     return replace(_finish(smoothed, xy, board.spacing, uv, fitted), tags=Tags(int(seen.sum())))
 
 
@@ -85,7 +88,7 @@ def _from_seeds(image: Smoothed, board: AprilGrid, tags: NDArray[np.int32], corn
     first = np.flatnonzero(seen)
     if len(first) >= 2:
         first = first[_largest_agreement(xy[first], seed[first])]
-    uv, fitted = _grow(image, xy, 1 + board.spacing, seed, first, _SEARCH)
+    uv, fitted, _ = _grow(image, xy, 1 + board.spacing, seed, first, _SEARCH)
     known = fitted.any(1)
     if known.sum() >= 2:
         counts = Tags(int(seen.sum()), int((seen & ~known).sum()), foreign)
@@ -152,28 +155,30 @@ def _inside(image: Image | Smoothed, corners: Array) -> Mask:
     return np.asarray(((corners > 1) & (corners < np.array(image.shape[::-1]) - 2)).all(-1))
 
 
-def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[np.intp], effort: _Effort) -> tuple[Array, Mask]:
+def _grow(image: Smoothed, xy: Array, step: float, seed: Array, first: NDArray[np.intp], effort: _Effort) -> tuple[Array, Mask, int]:
     """Return the corners uv (t, 4, 2) of all tags that the seeds of the `first` (k,) lead to, and which (t, 4) were fitted.
 
-    Each tag next to known ones starts from its seed where that is near the place foretold, else from there.
+    And how many tags are missing that should be in view. Each tag next to known ones starts from its seed where that is near the place
+    foretold, else from there.
     """
     uv, fitted = np.zeros_like(xy), np.zeros(xy.shape[:2], bool)
     uv[first], fitted[first] = seed[first], True
     centre = xy.mean(1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1) / step
     known: Mask = np.asarray(fitted.any(1))
-    asked = known.copy()
+    asked, missed = known.copy(), 0
     for reach in effort.reaches:
         neighbour = apart < reach
         ask = np.flatnonzero(~asked & neighbour[:, known].any(1))
         while len(ask):
             tried = _try(image, xy, step, uv, fitted, seed, ask, effort)
             asked[ask] = True
+            missed += int((tried.in_view & ~tried.good).sum())
             found = ask[tried.good]
             uv[found], fitted[found] = tried.corners[tried.good], tried.ok[tried.good]
             known[found] = True
             ask = np.flatnonzero(~known & neighbour[:, found].any(1))  # tags with a new neighbour to lead to them
-    return uv, fitted
+    return uv, fitted, missed
 
 
 @dataclass(frozen=True)
@@ -183,13 +188,14 @@ class _Tried:
     corners: Array  # (m, 4, 2)
     ok: Mask  # (m, 4) saddles
     good: Mask  # (m,) three saddles or more and the code
+    in_view: Mask  # (m,) foretold to be, at the last
 
 
 def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed: Array, ask: NDArray[np.intp], effort: _Effort) -> _Tried:
     """Look for the tags `ask` (m,). Where only the corners towards the known tags are found, they help to foretell the others once more."""
     uv, fitted = uv.copy(), fitted.copy()
     m = len(ask)
-    out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool))
+    out = _Tried(np.zeros((m, 4, 2)), np.zeros((m, 4), bool), np.zeros(m, bool), np.zeros(m, bool))
     todo = np.arange(m)
     for window, beyond in effort.tries:
         start = predict(xy[fitted], uv[fitted], xy[ask[todo]], step)
@@ -198,6 +204,7 @@ def _try(image: Smoothed, xy: Array, step: float, uv: Array, fitted: Mask, seed:
         start = np.where(near[:, None, None], seeds, start)
         outside = np.maximum(-start, start - image.shape[::-1]).max((1, 2))
         in_view = outside < beyond * _sides(start)
+        out.in_view[todo] = outside < -_WELL_INSIDE * _sides(start)
         todo, start = todo[in_view], start[in_view]
         if not len(todo):
             break

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibkit.detection import aprilgrid
 from calibkit.detection.boards import detect
 from calibkit.detection.found import Detection, Gray, Image, scaled_to, to_8_bit
+from calibkit.detection.plane_maps import middling
 from calibkit.models.board import AprilGrid, Board
 from calibkit.opencv import cv2
 
@@ -23,9 +24,9 @@ FOLLOWERS: dict[str, Callable[[Image, Any, NDArray[np.int32], Array], Detection 
 _SIZE = 376  # px, long side of the images in which the flow is sought: it need not be exact
 _WINDOW, _LEVELS = (11, 11), 3  # finds motions up to some 100 px of 752
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
-_POINTS = 24  # at most, that the flow follows
+_POINTS = 36  # at most, that the flow follows
 _FEWEST = 8  # of them that agree
-_AGREE_PX = 3.0  # with one homography, in the image's own px
+_AGREE_PX = 6.0  # with one homography: at a fisheye's rim as much is bent by the lens
 _PATIENCE = 2  # searches in vain for a board that flow foretold: these images are no video
 
 
@@ -61,15 +62,23 @@ class Sequence:
 
 
 def _carried(last: Gray, now: Gray, uv: Array, scale: float) -> Array | None:
-    """Return where points uv (n, 2) of the last image are now, by the homography that most of some of them have moved by."""
+    """Return where points uv (n, 2) of the last image are now: by the homography that some of them have moved by, and beside it as those
+    around, since a lens bends.
+    """
     some = uv[np.unique(np.linspace(0, len(uv) - 1, _POINTS).astype(int))]
     start = ((some + 0.5) * scale - 0.5).astype(np.float32)
     end, found, _ = cv2.calcOpticalFlowPyrLK(last, now, start, np.zeros_like(start), winSize=_WINDOW, maxLevel=_LEVELS, criteria=_STOP)
     moved = found.ravel() > 0
     if moved.sum() < _FEWEST:
         return None
-    H, agree = cv2.findHomography(some[moved], (end[moved].astype(float) + 0.5) / scale - 0.5, cv2.RANSAC, _AGREE_PX)
-    if H is None or agree.sum() < max(_FEWEST, moved.sum() / 2):
+    before, after = some[moved], (end[moved].astype(float) + 0.5) / scale - 0.5
+    H, inliers = cv2.findHomography(before, after, cv2.RANSAC, _AGREE_PX / scale)
+    if H is None or inliers.sum() < max(_FEWEST, moved.sum() / 2):
         return None
-    out: Array = cv2.perspectiveTransform(uv[None], H)[0]
+    agree = inliers.ravel() > 0
+    before, after = before[agree], after[agree]
+    beside = after - cv2.perspectiveTransform(before[None], H)[0]
+    apart = ((uv[:, None] - before) ** 2).sum(-1)
+    weight = np.exp(-apart / (2 * middling(np.sort(apart, axis=1)[:, 1])))
+    out: Array = cv2.perspectiveTransform(uv[None], H)[0] + weight @ beside / (weight.sum(1, keepdims=True) + 0.1)
     return out

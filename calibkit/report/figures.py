@@ -29,6 +29,7 @@ from calibkit.report.time_offset_figures import offset_over_time, v_curve
 from calibkit.report.view import View, given
 
 MAX_BARS = 120
+MAX_POINTS = 20000  # of a scatter
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "calibkit",  # ids that do not change from run to run
     "font.family": "DejaVu Sans",
@@ -131,7 +132,8 @@ def _scatter(figure: Figure, view: View) -> None:
     kept, dropped = view.raw[view.kept], view.raw[~view.kept]
     sigma = float(np.sqrt(np.mean(kept**2)))
     reach = 5 * sigma if sigma > 0 else 1.0
-    left.plot(*kept.T, ".", color=INK, ms=2.5, alpha=float(np.clip(3000 / len(kept), 0.15, 0.7)), mew=0, rasterized=True)
+    few = kept[:: 1 + len(kept) // MAX_POINTS]
+    left.plot(*few.T, ".", color=INK, ms=2.5, alpha=float(np.clip(3000 / len(few), 0.15, 0.7)), mew=0, rasterized=True)
     near = dropped[np.all(np.abs(dropped) < reach, axis=1)]
     left.plot(*near.T, "x", color=ACCENT, ms=4, rasterized=True)
     for k in (1, 2, 3):

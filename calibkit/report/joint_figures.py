@@ -11,7 +11,7 @@ from calibkit.report.view import Array, View, given
 from calibkit.report.whiteness import autocorrelation, spectrum
 
 STRETCH_S = 1.5
-MAX_POINTS = 6000  # of a cloud
+MAX_POINTS = 3000  # of a cloud
 FINE = 4
 MAX_BINS = 400  # of a spectrum, neighbouring lines are averaged; and of a curve of biases, which are slow
 

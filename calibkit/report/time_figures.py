@@ -8,6 +8,7 @@ from calibkit.report.look import ACCENT, INK, PALE
 from calibkit.report.view import Array, View, given
 
 _BINS, _FEWEST = 20, 3  # frames of a bin
+_MANY = 200  # points that are cheaper as pixels
 
 
 def over_time(figure: Figure, view: View) -> None:
@@ -28,7 +29,7 @@ def over_time(figure: Figure, view: View) -> None:
     panels = figure.subplots(2, len(axis), squeeze=False, sharex="col", sharey="row")
     for column, (label, x) in enumerate(axis):
         top, bottom = panels[:, column]
-        top.plot(x, view.frame_rms[some], ".", color=PALE, ms=3.5, mew=0, rasterized=len(x) > 2000)
+        top.plot(x, view.frame_rms[some], ".", color=PALE, ms=3.5, mew=0, rasterized=len(x) > _MANY)
         _means(top, x, view.frame_rms[some], "", INK, "o", 0.0)
         top.set(ylim=(0, None))
         for k, (values, name, colour, mark) in enumerate(zip(means, ("x", "y", "outwards"), (INK, ACCENT, "#3f7d58"), "os^", strict=True)):
@@ -37,7 +38,9 @@ def over_time(figure: Figure, view: View) -> None:
         bottom.set_xlabel(label)
     panels[0, 0].set(ylabel=f"rms of a frame ({view.unit})", title="points: frames; bars: means of neighbouring ones with 2 sigma")
     panels[1, 0].set_ylabel(f"mean residual ({view.unit})")
-    panels[1, 0].legend(frameon=False, ncols=3)
+    low, high = panels[1, 0].get_ylim()
+    panels[1, 0].set_ylim(low, high + 0.25 * (high - low))
+    panels[1, 0].legend(frameon=False, ncols=3, loc="upper left", fontsize=8)
 
 
 def _means(axes: Axes, x: Array, values: Array, label: str, colour: str, mark: str, shift: float) -> None:

@@ -175,8 +175,8 @@ from calibkit.detection import crew
 from calibkit.detection.find import find_boards
 from calibkit.models.board import AprilGrid
 crew.os.cpu_count = lambda: 2
-frames = [ImageFrame(k, str(k), b"", partial(np.full, (240, 320), k, np.uint8)) for k in range(120)]
-print(find_boards(frames, AprilGrid(4, 3, 0.088, 0.3), "cam0", None, silent, 120).n_images)
+frames = [ImageFrame(k, str(k), b"", partial(np.full, (240, 320), k, np.uint8)) for k in range(240)]
+print(find_boards(frames, AprilGrid(4, 3, 0.088, 0.3), "cam0", None, silent, 240).n_images)
 """
 
 
@@ -184,7 +184,7 @@ print(find_boards(frames, AprilGrid(4, 3, 0.088, 0.3), "cam0", None, silent, 120
 def test_processes_do_not_run_the_callers_script(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert (ran.stdout, ran.stderr) == ("once\n120\n", "")
+    assert (ran.stdout, ran.stderr) == ("once\n240\n", "")
 
 
 def test_second_run_decodes_nothing(images: list[NDArray[np.uint8]], tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from calibkit.opencv import cv2
 
 Answers = list["Entry | BadInputError"]
 
-_MANY = 100  # images: so many are worth the start of processes
+_MANY = 200  # images: so many are worth the start of processes
 
 
 class _Stop(Protocol):

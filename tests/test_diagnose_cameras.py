@@ -138,8 +138,10 @@ def test_the_command_without_an_imu(run: Run, tmp_path: Path) -> None:
     parameters = {key: Estimate(value=float(value), sigma=1e-4 * abs(float(value))) for key, value in zip(names, LEFT.params, strict=True)}
     save_rig(Rig(cameras={"cam0": Camera(model="pinhole-radtan", resolution=LEFT.size, parameters=parameters)}), tmp_path / "rig.yaml")
     asked = ("diagnose", corners, "--target", TARGET, "--rig", tmp_path / "rig.yaml", "--camera", "corners")
-    said = run(*asked, "--json", tmp_path / "found.json")
+    said = run(*asked, "--json", tmp_path / "found.json", "--report", tmp_path / "report")
     assert said.code == 1
+    names = {path.name for path in (tmp_path / "report" / "pictures").iterdir()}
+    assert {"Causes-suspects.png", "cam0-diagnose-field.png"} <= names
     size = re.search(r"FAIL: cam0's focal length is longer by (\S+) \+- (\S+) px", said.out)
     assert size is not None, said.out
     assert float(size[1]) == pytest.approx(2.3025, abs=4 * float(size[2]))

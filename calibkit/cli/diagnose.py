@@ -53,11 +53,17 @@ def run(
     )
     asked = Options(**read, temperature=temperature)
     alone = no_imu or not has_imu(sources, asked)
-    given = {"--temperature": temperature, "--imu": imu, "--report": report}
-    if alone and (wrong := [name for name, value in given.items() if value]):
-        raise BadInputError(f"{wrong[0]} is for cameras with an IMU: leave it out, or give the IMU's recording")
+    if alone and (temperature or imu):
+        raise BadInputError(
+            f"{'--temperature' if temperature else '--imu'} is for cameras with an IMU: leave it out, or give the IMU's recording"
+        )
     if alone:
-        tell(diagnose_cameras(sources, target, known, asked, bar), json_file, force)
+        cameras = diagnose_cameras(sources, target, known, asked, bar)
+        if report is not None:
+            from calibkit.stages.diagnose_report import write_cameras
+
+            write_cameras(cameras, report, options.command())
+        tell(cameras.diagnosed, json_file, force, report)
     found = examine(sources, target, known, asked, bar)
     if report is not None:
         from calibkit.stages.diagnose_report import write_diagnosis

@@ -83,7 +83,7 @@ def _result(requests: Sequence[CameraRequest], groups: list[list[int]], solved: 
         for i, c in enumerate(group):
             name = requests[c].views.camera
             cameras[name] = _camera(part, i, requests[c].topic)
-            residuals.append(_residual_set(part.fit, i))
+            residuals.append(corner_set(part.fit, i))
             reasons += part.judgements[i].reasons
             unknown += [f"{name}.{p}" for p, e in cameras[name].parameters.items() if e.status is Status.NOT_OBSERVABLE]
             _camera_facts(facts, name, part, i, scores[c], requests[c])
@@ -152,7 +152,7 @@ def _rms(px: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
     return float(np.sqrt(np.sum(px**2) / max(len(px), 1)))
 
 
-def _residual_set(fit: LensFit, i: int) -> ResidualSet:
+def corner_set(fit: LensFit, i: int) -> ResidualSet:
     """Return every found corner's residual, rows in the order of the views; NaN where the model has no prediction."""
     _, every = fit.residuals(i)
     frame, corner = np.nonzero(fit.observed[i])

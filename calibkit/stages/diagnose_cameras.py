@@ -1,6 +1,7 @@
 """`calibkit diagnose` of a recording without an IMU: whether lenses and places of cameras still fit it, and what is wrong with them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -23,7 +24,18 @@ from calibkit.stages.diagnose import Diagnosed, Rms, noisier_corners
 _MAX_VIEWS = 1500
 
 
-def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: Sensors, progress: Progress) -> Diagnosed:
+@dataclass(frozen=True)
+class CamerasExamined:
+    """A recording's own calibration of cameras beside the one under test."""
+
+    read: CamerasRead
+    rig: Rig
+    held: tuple[LensFit, ...]  # the calibration under test with the board's poses that suit it best, of cameras that see it at once
+    about: About
+    diagnosed: Diagnosed
+
+
+def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: Sensors, progress: Progress) -> CamerasExamined:
     """Test a rig file's cameras against a recording before a board.
 
     BadInputError names the file, topic or option that is wrong, or what the rig file lacks; NotConvergedError: no lens fits the recording.
@@ -32,7 +44,7 @@ def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: S
     models = [lens.model for lens in read.lenses]
     instants = match_instants(read.views)
     groups = components(instants)
-    parts, rms, lenses, corners = [], {}, {}, {}
+    parts, fits, rms, lenses, corners = [], [], {}, {}, {}
     with threadpool_limits(1, user_api="blas"):
         for group in progress(groups, "cameras", len(groups)):
             own = [models[c] for c in group]
@@ -41,7 +53,8 @@ def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: S
             _refuse_unsettled(fit, read)
             known = [_known(rig, read.names[c], read.lenses[c], read.names[group[0]]) for c in group]
             parts.append(lens_evidence(fit, known, group))
-            held, best = corners_rms(with_poses(fit, known)), corners_rms(fit)
+            fits.append(with_poses(fit, known))
+            held, best = corners_rms(fits[-1]), corners_rms(fit)
             for i, c in enumerate(group):
                 rms[c] = Rms(f"{read.names[c]}'s corners", "px", held[i], best[i])
                 lenses[c], corners[c] = fit.state.lenses[i], fit.problem.cameras[i].uv[fit.kept[i]]
@@ -58,7 +71,7 @@ def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: S
     )
     told = tuple(in_words(cause, about) for cause in diagnosis.causes)
     of_rms = tuple(rms[c] for c in order)
-    return Diagnosed(
+    diagnosed = Diagnosed(
         f"{', '.join(read.names)}, without an IMU: {sum(len(each) for each in corners.values())} corners",
         diagnosis,
         told,
@@ -68,6 +81,7 @@ def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: S
         tuple(read.warnings),
         "intrinsics",
     )
+    return CamerasExamined(read, rig, tuple(fits), about, diagnosed)
 
 
 def _refuse_unsettled(fit: LensFit, read: CamerasRead) -> None:

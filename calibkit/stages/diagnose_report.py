@@ -1,7 +1,7 @@
 """The report of a diagnosis or a validation: the page of every stage, and what was found of the suspects before it."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibkit.data.result import ResidualSet, Result
-from calibkit.data.rig import InputFile, StageRun
+from calibkit.data.rig import InputFile, Rig, StageRun
 from calibkit.data.verdict import Reason, Verdict
 from calibkit.errors import one_line
-from calibkit.estimation.diagnosis import Cause
+from calibkit.estimation.diagnosis import Alone, Cause
 from calibkit.estimation.diagnosis_signature import Course, Signature, courses, signatures
-from calibkit.estimation.diagnosis_words import base_of, bending, named, number, unit_of
+from calibkit.estimation.diagnosis_words import About, base_of, bending, named, number, unit_of
+from calibkit.estimation.intrinsics import corner_set
 from calibkit.estimation.joint_result import residual_sets
 from calibkit.geometry.so3 import Array
 from calibkit.report.parameters import rows
@@ -22,6 +23,7 @@ from calibkit.report.signals import measure
 from calibkit.report.summary import Summary
 from calibkit.report.view import views
 from calibkit.stages.diagnose import Diagnosed, Examined, sensors_of
+from calibkit.stages.diagnose_cameras import CamerasExamined
 from calibkit.stages.report import write_pages
 from calibkit.version import __version__
 
@@ -52,33 +54,51 @@ def reasons_of(diagnosed: Diagnosed) -> list[Reason]:
     return [*reasons, *(Reason(Verdict.PASS, noise.text) for noise in diagnosed.noise)]
 
 
+def write_cameras(found: CamerasExamined, folder: Path, command: str) -> None:
+    """Write the report of `calibkit diagnose` on a recording without an IMU."""
+    sets = [corner_set(fit, i) for fit in found.held for i in range(len(fit.views))]
+    labels = {views_.camera: list(views_.labels) for fit in found.held for views_ in fit.views}
+    page = _Page("diagnose", command, found.rig, found.read.recording.inputs(), tuple(sets), {"frame_labels": labels})
+    summary = page.summary(found.diagnosed, reasons_of(found.diagnosed), found.diagnosed.as_json())
+    write_pages(summary, folder, chapters=[_suspects(found.diagnosed, found.about)])
+
+
 def summary_of(
     found: Examined, stage: str, command: str, reasons: Sequence[Reason], told: dict[str, object], tables: Sequence[object] = ()
 ) -> Summary:
-    """Return what the report says before it is drawn: its verdict is that of the reasons alone, the signals are to be looked at."""
-    read, diagnosed, joint = found.read, found.diagnosed, found.joint
-    inputs = [InputFile(name=one_line(name), sha256=digest) for name, digest in read.inputs]
-    run = StageRun(stage=stage, command=one_line(command, 2000), calibkit=__version__, inputs=inputs)
-    rig = found.rig.model_copy(update={"provenance": [run]})
+    """Return what the report of cameras and an IMU says before it is drawn."""
+    read, joint = found.read, found.joint
     under_test = replace(joint, fit=replace(joint.fit, x=found.held))
-    sets = [_with_temperature(found, each) for each in residual_sets(under_test, read.views, [read.imu.name])]
-    rms = [["residuals, rms", "by the rig file", "at best", "unit"]]
-    rms += [[each.sensor, f"{each.held:.3g}", f"{each.best:.3g}", each.unit] for each in diagnosed.rms]
-    lines = [f"under test, on {diagnosed.what}"]
-    lines += [f"not tested, the motion does not tell them: {', '.join(diagnosed.untested)}"] if diagnosed.untested else []
-    facts: dict[str, object] = {
-        "lines": lines,
-        "tables": [rms, *tables],
-        "frame_labels": {
-            name: [views_.labels[i] for i in some] for name, views_, some in zip(read.names, read.views, joint.frames, strict=True)
-        },
-        "t_zero_ns": dict.fromkeys((each.sensor for each in sets), joint.origin_ns),
-        "found": told,
-    }
-    result = Result(stage, rig, tuple(reasons), tuple(sets), facts)
-    seen = tuple(views(result))
-    signals = tuple(signal for view in seen for signal in measure(view))
-    return Summary(rig, (result,), tuple(reasons), tuple(rows(rig)), seen, signals)
+    sets = tuple(_with_temperature(found, each) for each in residual_sets(under_test, read.views, [read.imu.name]))
+    labels = {name: [views_.labels[i] for i in some] for name, views_, some in zip(read.names, read.views, joint.frames, strict=True)}
+    facts = {"frame_labels": labels, "t_zero_ns": dict.fromkeys((each.sensor for each in sets), joint.origin_ns)}
+    return _Page(stage, command, found.rig, read.inputs, sets, facts).summary(found.diagnosed, reasons, told, tables)
+
+
+@dataclass(frozen=True)
+class _Page:
+    """What a report of a diagnosis is made from."""
+
+    stage: str
+    command: str
+    rig: Rig
+    inputs: Sequence[tuple[str, str | None]]
+    sets: tuple[ResidualSet, ...]  # under the calibration under test
+    facts: dict[str, object]
+
+    def summary(self, diagnosed: Diagnosed, reasons: Sequence[Reason], told: dict[str, object], tables: Sequence[object] = ()) -> Summary:
+        """Return what it says: its verdict is that of the reasons alone, the signals are to be looked at."""
+        inputs = [InputFile(name=one_line(name), sha256=digest) for name, digest in self.inputs]
+        run = StageRun(stage=self.stage, command=one_line(self.command, 2000), calibkit=__version__, inputs=inputs)
+        rig = self.rig.model_copy(update={"provenance": [run]})
+        rms = [["residuals, rms", "by the rig file", "at best", "unit"]]
+        rms += [[each.sensor, f"{each.held:.3g}", f"{each.best:.3g}", each.unit] for each in diagnosed.rms]
+        lines = [f"under test, on {diagnosed.what}"]
+        lines += [f"not tested, the motion does not tell them: {', '.join(diagnosed.untested)}"] if diagnosed.untested else []
+        result = Result(self.stage, rig, tuple(reasons), self.sets, {**self.facts, "lines": lines, "tables": [rms, *tables], "found": told})
+        seen = tuple(views(result))
+        signals = tuple(signal for view in seen for signal in measure(view))
+        return Summary(rig, (result,), tuple(reasons), tuple(rows(rig)), seen, signals)
 
 
 def _with_temperature(found: Examined, residuals: ResidualSet) -> ResidualSet:
@@ -89,33 +109,37 @@ def _with_temperature(found: Examined, residuals: ResidualSet) -> ResidualSet:
 
 def chapters_of(found: Examined) -> list["Chapter"]:
     """Return the pictures of the suspects, and of each that is named."""
+    from calibkit.report.figures import Chapter
+
+    out = [_suspects(found.diagnosed, found.about)]
+    for k, cause in enumerate(found.causes):
+        out.append(Chapter(f"Cause {k + 1}: {named(cause.key, found.about)}", tuple(_of_cause(found, cause)), found.diagnosed.told[k].text))
+    return out
+
+
+def _suspects(diagnosed: Diagnosed, about: About) -> "Chapter":
     from calibkit.report.diagnosis_figures import Bar, suspects
     from calibkit.report.figures import Chapter, Plate
 
-    diagnosis, about = found.diagnosed.diagnosis, found.about
-    shares = {cause.key: cause.share for cause in found.causes}
+    diagnosis = diagnosed.diagnosis
+    shares = {cause.key: cause.share for cause in diagnosis.causes}
     order = sorted(diagnosis.alone, key=lambda key: (key not in shares, -diagnosis.alone[key].share))[:_BARS]
-    bars = [Bar(named(key, about), _size(key, found), diagnosis.alone[key].share, shares.get(key)) for key in order]
+    bars = [Bar(named(key, about), _size(key, diagnosis.alone[key], about), diagnosis.alone[key].share, shares.get(key)) for key in order]
     caption = (
         "The excess is what the residuals have more under this calibration than at the recording's own best. One long bar that is named is "
         "good: one thing to mend. Long bars that are not named are explained by those that are; if none is, all of it is within chance."
     )
-    plate = Plate("suspects", "Suspected causes", caption, 1.0 + 0.24 * len(bars), partial(suspects, bars=bars))
-    out = [Chapter("Causes", (plate,))]
-    for k, cause in enumerate(found.causes):
-        out.append(Chapter(f"Cause {k + 1}: {named(cause.key, about)}", tuple(_of_cause(found, cause)), found.diagnosed.told[k].text))
-    return out
+    return Chapter("Causes", (Plate("suspects", "Suspected causes", caption, 1.0 + 0.24 * len(bars), partial(suspects, bars=bars)),))
 
 
-def _size(key: str, found: Examined) -> str:
-    alone, (unit, scale) = found.diagnosed.diagnosis.alone[key], unit_of(key)
+def _size(key: str, alone: Alone, about: About) -> str:
+    unit, scale = unit_of(key)
     if key.startswith("distortion "):
-        return f"{np.sqrt(np.mean(np.sum(bending(alone.theta, found.about, int(key[-1]))[1] ** 2, axis=1))):.2g} px rms"
+        return f"{np.sqrt(np.mean(np.sum(bending(alone.theta, about, int(key[-1]))[1] ** 2, axis=1))):.2g} px rms"
     if len(alone.theta) > 1:
         return f"{len(alone.theta)} numbers"
-    return f"{number(float(alone.theta[0]) * scale, float(np.sqrt(alone.cov[0, 0])) * scale)} {unit}".replace("+-", "±").replace(
-        " us", " µs"
-    )
+    text = f"{number(float(alone.theta[0]) * scale, float(np.sqrt(alone.cov[0, 0])) * scale)} {unit}"
+    return text.replace("+-", "±").replace(" us", " µs")
 
 
 def _of_cause(found: Examined, cause: Cause) -> list["Plate"]:

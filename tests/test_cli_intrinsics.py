@@ -15,7 +15,7 @@ from rigs import full_rig
 from calibkit.data.observations import BoardViews
 from calibkit.data.rig import Camera, Rig
 from calibkit.data.verdict import Status
-from calibkit.detection import find
+from calibkit.detection import crew
 from calibkit.estimation import intrinsics
 from calibkit.geometry import se3, so3
 from calibkit.io.rig_file import load_rig, save_rig
@@ -139,7 +139,7 @@ def test_a_second_run_finds_no_corners_anew_and_says_the_same(tmp_path, rendered
     first, second, third = (tmp_path / f"{name}.yaml" for name in ("first", "second", "third"))
     arguments = (rendered, "--target", target, "--model", "pinhole-radtan", "-o")
     assert run(*arguments, first).code == 0
-    monkeypatch.setattr(find, "detect", None)  # whoever detects again fails
+    monkeypatch.setattr(crew, "look_through", None)  # whoever detects again fails
     assert run(*arguments, second).code == 0
     assert numbers(load_rig(first)) == numbers(load_rig(second))
     assert run(*arguments, third, "--no-cache").code != 0

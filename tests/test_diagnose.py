@@ -18,7 +18,7 @@ from recorded_files import table, write_imu
 from scipy.optimize import least_squares
 from time_offset_samples import camera_session
 
-from calibkit.estimation.diagnosis import Cause, Diagnosis, Evidence, Suspect, diagnose
+from calibkit.estimation.diagnosis import Cause, Diagnosis, Evidence, Suspect, diagnose, log_tail
 from calibkit.estimation.diagnosis_signature import courses, signatures
 from calibkit.estimation.diagnosis_words import About, bending, in_words
 from calibkit.estimation.joint_problem import Drift
@@ -214,6 +214,16 @@ def test_a_lens_that_bends_otherwise_is_told_by_what_turning_and_focusing_anew_l
     np.testing.assert_allclose(found, left(best), atol=0.02 * np.abs(found).max())
     told = in_words(Cause("distortion 0", step, 1e-8 * np.eye(4), -50.0, 0.9), about)
     assert f"corners are off by {np.sqrt(np.mean(np.sum(found**2, axis=1))):.2g} px rms" in told.text
+
+
+def test_causes_beyond_all_doubt_are_still_ranked() -> None:
+    """Chances below the smallest number: of two degrees of freedom they are x^(f/2) exactly."""
+    for chi2, freedom in ((3.0, 10.0), (1e5, 600.0), (5000.0, 1e5)):
+        assert log_tail(chi2, 2, freedom) == pytest.approx(freedom / 2 * np.log(freedom / (freedom + chi2)), rel=1e-12)
+    mixed = np.array([[1.0, 0.9], [0.9, 1.0]])
+    suspects = [Suspect("follows", np.array([[1.0], [0.0]])), Suspect("guilty", np.array([[0.0], [1.0]]))]
+    found = diagnose(Evidence(np.array([0.0, 1000.0]), np.linalg.inv(mixed), mixed, np.ones(2), 600.0), suspects)
+    assert [cause.key for cause in found.causes] == ["guilty"]
 
 
 def test_chance_names_a_cause_in_one_of_a_hundred() -> None:

@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calibkit.geometry.so3 import Array
 
 FAMILY_WISE = 0.01
+_TERMS = 40  # over 1 - x: of a series of about x^n, to rounding
 _MOST = 4  # causes at once: with more the calibration as a whole does not fit
 _AS_GOOD = 9.0  # of evidence: another cause that has less than this less is not told from the first
 
@@ -154,10 +155,22 @@ class _Scaled:
 
     def log_p(self, chi2: float, d: int) -> float:
         """Return log P(evidence >= chi2): F, since the covariance is itself known by some blocks only."""
-        return float(stats.f.logsf(chi2 / max(d, 1), max(d, 1), self.freedom)) if d else 0.0
+        return log_tail(chi2, d, self.freedom) if d else 0.0
 
     def sigma(self, column: Array) -> float:
         """Return how well the recording tells a suspect by itself, relative to what its own columns must be known to."""
         cov = np.linalg.pinv(column.T @ self.M @ column, hermitian=True)
         size = np.linalg.norm(column, axis=0)
         return float(np.max(np.sqrt(np.diag(cov)) * size))
+
+
+def log_tail(chi2: float, d: int, freedom: float) -> float:
+    """Return log P(d F >= chi2) of F with d and `freedom` degrees of freedom: log I_x(a, b), and its series where that is no number."""
+    a, b, x = freedom / 2, d / 2, freedom / (freedom + max(chi2, 0.0))
+    chance = float(special.betainc(a, b, x))
+    if chance > 0:
+        return float(np.log(chance))
+    # DLMF 8.17.8: I_x(a, b) = x^a (1 - x)^b / (a B(a, b)) sum_n x^n (a + b)_n / (a + 1)_n
+    n = np.arange(int(np.ceil(_TERMS / (1 - x))))
+    terms = np.cumprod(x * (a + b + n) / (a + 1 + n))
+    return float(a * np.log(x) + b * np.log1p(-x) - np.log(a) - special.betaln(a, b) + np.log1p(terms.sum()))

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_smoothing_spline
 
 from calibkit.data.observations import ImuSamples
 from calibkit.estimation.board_poses import BoardPoses
@@ -36,6 +35,8 @@ def camera_accelerations(poses: BoardPoses, origin_ns: int, turns: bool) -> Acce
     In the board's frame; of a camera that does not turn in its own, where the board's tilt, hardly known before a board that is never
     tilted, does not matter.
     """
+    from scipy.interpolate import make_smoothing_spline  # slow to import, and turns mostly suffice
+
     rows = in_order(poses.t_ns)
     if len(rows) < _FEWEST:
         return None

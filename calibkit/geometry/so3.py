@@ -23,7 +23,7 @@ def hat(v: Array) -> Array:
     return out
 
 
-def _sinc_terms(angle2: Array) -> tuple[Array, Array]:
+def sinc_terms(angle2: Array) -> tuple[Array, Array]:
     """Return sin(a)/a and (1 - cos(a))/a^2 from a^2, exact at every angle."""
     small = angle2 < _SMALL_ANGLE**2
     safe = np.where(small, 1.0, angle2)
@@ -34,10 +34,19 @@ def _sinc_terms(angle2: Array) -> tuple[Array, Array]:
     return first, second
 
 
+def third_term(angle2: Array) -> Array:
+    """Return (a - sin(a))/a^3 from a^2, exact at every angle."""
+    small = angle2 < 1e-4  # a wider switch than the others': it cancels as a^3
+    safe = np.where(small, 1.0, angle2)
+    angle = np.sqrt(safe)
+    third: Array = np.where(small, 1 / 6 - angle2 / 120 + angle2**2 / 5040, (angle - np.sin(angle)) / (safe * angle))
+    return third
+
+
 def exp(v: Array) -> Array:
     """Return exp(hat(v)) = I + sin(a)/a hat(v) + (1 - cos(a))/a^2 hat(v)^2 (Rodrigues), (..., 3) rad -> (..., 3, 3)."""
     v = np.asarray(v, float)
-    first, second = _sinc_terms(np.sum(v * v, axis=-1))
+    first, second = sinc_terms(np.sum(v * v, axis=-1))
     k = hat(v)
     rotation: Array = np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
     return rotation
@@ -47,11 +56,7 @@ def right_jacobian(v: Array) -> Array:
     """Return J_r with exp(v + d) = exp(v) exp(J_r(v) d) to first order (Sola 2018, eq. 143), (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, float)
     angle2 = np.sum(v * v, axis=-1)
-    _, second = _sinc_terms(angle2)
-    small = angle2 < 1e-4  # the third-order term's series: a wider switch, it cancels as a^3
-    safe = np.where(small, 1.0, angle2)
-    angle = np.sqrt(safe)
-    third = np.where(small, 1 / 6 - angle2 / 120 + angle2**2 / 5040, (angle - np.sin(angle)) / (safe * angle))
+    (_, second), third = sinc_terms(angle2), third_term(angle2)
     k = hat(v)
     jacobian: Array = np.eye(3) - second[..., None, None] * k + third[..., None, None] * (k @ k)
     return jacobian
@@ -110,7 +115,7 @@ def quat_exp(v: Array) -> Array:
     """Return unit quaternions xyzw of rotation vectors, (..., 3) rad -> (..., 4): (sin(a/2) v/a, cos(a/2))."""
     v = np.asarray(v, float)
     half2 = np.sum(v * v, axis=-1, keepdims=True) / 4
-    sinc, _ = _sinc_terms(half2)
+    sinc, _ = sinc_terms(half2)
     return np.concatenate([sinc / 2 * v, np.cos(np.sqrt(half2))], axis=-1)
 
 

@@ -16,6 +16,7 @@ from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
 
 Index = NDArray[np.int64]
+_ONE = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,14 @@ class Steps:
 
     d: Array  # (m - 1, 3) rad, log(R_{j-1}^T R_j)
     right: Array  # (m - 1, 3, 3) J_r(d)^-1; J_l(d)^-1 is its transpose
+    angle2: Array  # (m - 1,) |d|^2
+    hat: Array  # (m - 1, 2, 3, 3) hat(d) and its square
 
     @classmethod
     def of(cls, R: Array) -> "Steps":
         d = so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
-        return cls(d, so3.right_jacobian_inverse(d))
+        k = so3.hat(d)
+        return cls(d, so3.right_jacobian_inverse(d), np.sum(d * d, axis=1), np.stack([k, k @ k], axis=1))
 
 
 @dataclass(frozen=True)
@@ -111,16 +115,20 @@ def turning(R: Array, steps: Steps, i: Index, value: Array, rate: Array, jacobia
     out, omega = R[i], np.zeros((n, 3))
     A, by_step = [], []  # A_j, and of rotation and rate (n, 6, 3) their derivatives by d_j, before what follows
     for j in range(1, order):
-        d = steps.d[i + j - 1]
-        step = lam[:, j, None] * d
-        Aj = so3.exp(step)
+        row, share = i + j - 1, lam[:, j]
+        # A_j and lambda_j J_r(lambda_j d_j): of one axis, whose matrices are the segment's
+        angle2, (k, kk) = share**2 * steps.angle2[row], steps.hat[row].transpose(1, 0, 2, 3)
+        first, second = so3.sinc_terms(angle2)
+        second *= share**2
+        Aj = _ONE + (share * first)[:, None, None] * k + second[:, None, None] * kk
         out = out @ Aj
         omega = (omega[:, None] @ Aj)[:, 0]
         if jacobians:
-            turned = lam[:, j, None, None] * so3.right_jacobian(step)
+            third = share**3 * so3.third_term(angle2)
+            turned = share[:, None, None] * _ONE - second[:, None, None] * k + third[:, None, None] * kk
             A.append(Aj)
-            by_step.append(np.concatenate([turned, so3.hat(omega) @ turned + dlam[:, j, None, None] * np.eye(3)], axis=2))
-        omega = omega + dlam[:, j, None] * d
+            by_step.append(np.concatenate([turned, so3.hat(omega) @ turned + dlam[:, j, None, None] * _ONE], axis=2))
+        omega = omega + dlam[:, j, None] * steps.d[row]
     if not jacobians:
         return Turning(out, omega, np.zeros((0, 3, order, 3)), np.zeros((0, 3, order, 3)))
     # From the last factor back: P^T is what follows.

@@ -102,7 +102,8 @@ def test_from_a_recording_to_a_rig_file_and_one_report(
 ) -> None:
     out, pages, js = tmp_path / "rig.yaml", tmp_path / "report", tmp_path / "all.json"
     drawn: list[tuple[str, str]] = []
-    monkeypatch.setattr(page, "draw", lambda view, kind: drawn.append((view.sensor, view.stage)) or [])
+    monkeypatch.setattr(page, "plates", lambda view: drawn.append((view.sensor, view.stage)) or [])
+    monkeypatch.setattr(page, "draw", lambda plates, formats: [])
     said = run(*asked, "-o", out, "--report", pages, "--json", js)
     assert said.code == 0, said
     assert stages_of(out) == STAGES

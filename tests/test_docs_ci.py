@@ -87,6 +87,19 @@ def test_the_script_calibrates_the_samples(tmp_path):
         assert "### Limits" in page
 
 
+@pytest.mark.slow
+def test_the_limits_of_the_rig_hold_after_every_stage(run, tmp_path):
+    """joint makes the lens anew without a held-out error of its own: a limit on it is on that of intrinsics."""
+    rig = tmp_path / "rig.yaml"
+    samples = [ROOT / "sample_bags" / "cam_imu.bag", "--target", ROOT / "sample_bags" / "target.yaml"]
+    assert run("calibrate", *samples, "-o", rig).code == 0
+    said = run("report", rig, "--limits", CI / "rig.limits.yaml")
+    assert (said.code, said.err) == (0, "")
+    assert "held_out_ratio      cam0 held-out rms over rms (intrinsics) " in said.out
+    assert "reprojection_rms    cam0 reprojection rms (joint) " in said.out
+    assert said.out.count("held-out rms over rms") == 1  # not among the signals that are judged
+
+
 def test_the_page_names_every_signal_and_its_examples_are_limits():
     page = (ROOT / "docs" / "ci.md").read_text()
     table = dict(re.findall(r"^\| `(\w+)` \| ([^|]*) \|", page, re.MULTILINE))

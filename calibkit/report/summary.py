@@ -56,7 +56,8 @@ NOTHING = Demands()
 def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (), demands: Demands = NOTHING) -> Summary:
     """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once.
 
-    What `earlier` ones leave is looked at, not judged. BadInputError for a limit on what the rig does not have.
+    What `earlier` ones leave is looked at, not judged, but limits may be set on it where no later one measures it. BadInputError for a
+    limit on what the rig does not have.
     """
     seen = tuple(view for result in results for view in views(result))
     signals = tuple(signal for view in seen for signal in measure(view))
@@ -67,7 +68,7 @@ def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (
     said += tuple(Reason(Verdict.FAIL, f"not observable in this recording: {name}") for name in unsaid)
     said += not_good(signals)
     parameters = tuple(rows(rig))
-    asked = check(demands.limits, parameters, signals)
+    asked = check(demands.limits, parameters, (*signals, *_untold(earlier, signals)))
     asked += (require_observable(parameters),) if demands.require_observable else ()
     said += tuple(one.reason for one in asked if not one.holds)
     lost = [f"{row.part} {row.name}" for row in parameters if row.status is Status.NOT_OBSERVABLE]
@@ -82,6 +83,13 @@ def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (
     drawn = {view.sensor for view in seen}
     old = tuple(view for result in earlier for view in views(result) if view.sensor not in drawn)
     return Summary(rig, tuple(results), tuple(unique), parameters, seen, signals, old, asked)
+
+
+def _untold(earlier: Sequence[Result], signals: Sequence[Signal]) -> tuple[Signal, ...]:
+    """Return what earlier stages measured and no later one did of the same sensor, as the held-out error of a lens that joint refined."""
+    told = {(signal.sensor, signal.probe.key) for signal in signals}
+    found = {(s.sensor, s.probe.key): s for result in earlier for view in views(result) for s in measure(view)}
+    return tuple(signal for key, signal in found.items() if key not in told)
 
 
 def _says(reason: Reason, name: str) -> bool:

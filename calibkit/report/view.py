@@ -201,7 +201,7 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         tilt=None if tilt is None else tilt.astype(float),
         image_size=size,
         centre=centre,
-        held_out_rms=camera.reprojection.held_out_rms_px if camera and camera.reprojection else None,
+        held_out_rms=_held_out(result, residuals.sensor, camera),
         n_lost=int(np.sum(~good)),
         noise=result.rig.imus[residuals.sensor].noise if residuals.sensor in result.rig.imus else {},
         axis=None if axis is None else axis.astype(np.intp),
@@ -236,6 +236,14 @@ def _view(result: Result, residuals: ResidualSet) -> View:
         bias_sigma=floats("bias_sigma", 6),
         hand_eye=hand_eye_of(result, residuals.sensor),
     )
+
+
+def _held_out(result: Result, sensor: str, camera: Camera | None) -> float | None:
+    """Return facts["held_out_px"][sensor], as a later stage may have made the camera anew, else what the rig says of it."""
+    by_sensor = result.facts.get("held_out_px")
+    if isinstance(by_sensor, Mapping) and sensor in by_sensor:
+        return _number(by_sensor[sensor])
+    return camera.reprojection.held_out_rms_px if camera and camera.reprojection else None
 
 
 def _lens(camera: Camera | None) -> KnownLens | None:

@@ -59,7 +59,9 @@ def intrinsics(
     views = observe(recording, topics, board, options, progress)
     requests = [CameraRequest(v, model, topics[v.camera]) for v, model in zip(views, models, strict=True)]
     result = calibrate_cameras(requests, options.robust, options.max_views, progress)
-    result = replace(result, facts={**result.facts, "warnings": [*recording.warnings, *(w for v in views for w in v.warnings)]})
+    warnings = [*recording.warnings, *(w for v in views for w in v.warnings)]
+    held_out = {name: camera.reprojection.held_out_rms_px for name, camera in result.rig.cameras.items() if camera.reprojection}
+    result = replace(result, facts={**result.facts, "warnings": warnings, "held_out_px": held_out})
     if outputs.out is not None or outputs.report is not None:
         result = replace(result, thumbnails=tuple(_worst_frames(result, recording, topics, progress)))
     told: dict[str, str | float | int | bool | None] = {

@@ -63,6 +63,10 @@ class TableRates:
     axis: Array | None = None  # (3,) that axis in the IMU's frame, where it is known
 
 
+class Lost(str):
+    """A warning that says what of the recording is lost: whatever is made from the rest is to be looked at."""
+
+
 @dataclass(frozen=True)
 class PoseSamples:
     """Poses T_parent_child over time."""

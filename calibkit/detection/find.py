@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibkit.data.observations import BoardViews, ImageFrame
+from calibkit.data.observations import BoardViews, ImageFrame, Lost
 from calibkit.data.plural import counted
 from calibkit.data.progress import Progress
 from calibkit.detection.cache import CornerCache
@@ -93,7 +93,7 @@ def _about_broken(broken: list[str], n_images: int) -> tuple[str, ...]:
         return ()
     more = f", and {len(broken) - _NAMED} more" if len(broken) > _NAMED else ""
     named = "; ".join(one_line(text, 120) for text in broken[:_NAMED])
-    return (f"{len(broken)} of {n_images} images could not be read: {named}{more}",)
+    return (Lost(f"{len(broken)} of {n_images} images could not be read: {named}{more}"),)
 
 
 def _about_tags(tags: list[Tags], camera: str) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from contextlib import closing
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.observations import FeatureTracks, ImageFrame
+from calibkit.data.observations import FeatureTracks, ImageFrame, Lost
 from calibkit.data.plural import counted
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
@@ -74,9 +74,9 @@ def track_features(
         )
         raise BadInputError(f"{camera}: {why}")
     frame_of, track, points = (np.concatenate(column) for column in zip(*rows, strict=True))
-    warnings = []
+    warnings: list[str] = []
     if broken:
-        warnings.append(f"{len(broken)} of {n_images} images could not be read, the first: {one_line(broken[0], 160)}")
+        warnings.append(Lost(f"{len(broken)} of {n_images} images could not be read, the first: {one_line(broken[0], 160)}"))
     if late:
         warnings.append(f"{late} of {n_images} images are left out: their stamps repeat or go back")
     if repeated:

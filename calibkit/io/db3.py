@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
+from calibkit.data.observations import Lost
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Channel, Message, ros_type
 
@@ -27,7 +28,8 @@ class Db3File:
         if path.stat().st_size == 0:
             raise BadInputError(f"{path.name} is empty: give a recording (.bag, .mcap, .db3, a folder or CSV)")
         if path.with_name(path.name + "-wal").exists():
-            self.warnings.append(f"{path.name}-wal holds messages not yet in {path.name}: run sqlite3 {path.name} 'PRAGMA wal_checkpoint'")
+            text = f"{path.name}-wal holds messages not yet in {path.name}: run sqlite3 {path.name} 'PRAGMA wal_checkpoint'"
+            self.warnings.append(Lost(text))
         try:
             self._open()
         except _ERRORS as error:
@@ -63,7 +65,7 @@ class Db3File:
             ) from error
         self._count(Counter(number for number, _ in found).items())
         self.start_ns = min((time for _, time in found), default=0)
-        self.warnings.insert(0, f"{self.path.name} is damaged ({why}): {len(found)} messages saved")
+        self.warnings.insert(0, Lost(f"{self.path.name} is damaged ({why}): {len(found)} messages saved"))
 
     def _count(self, numbers: Iterable[tuple[int, int]]) -> None:
         by_channel: Counter[Channel] = Counter(dict.fromkeys(self._channels.values(), 0))
@@ -102,7 +104,7 @@ class Db3File:
                 if isinstance(time, int) and isinstance(data, bytes):
                     yield number, time, data
         except _ERRORS as error:
-            text = f"{self.path.name} breaks off ({one_line(error)})"
+            text = Lost(f"{self.path.name} breaks off ({one_line(error)})")
             if text not in self.warnings:
                 self.warnings.append(text)
 

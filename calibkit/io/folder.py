@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from natsort import natsorted
 
-from calibkit.data.observations import ImageFrame
+from calibkit.data.observations import ImageFrame, Lost
 from calibkit.data.progress import Progress
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import images
@@ -74,7 +74,7 @@ def asl_camera(folder: Path, name: str) -> Source:
     if bad:
         source.warn(f"{name}: {bad} rows of data.csv are not `timestamp [ns],filename` and are left out")
     if missing:
-        source.warn(f"{name}: {missing} images of data.csv are missing in data/")
+        source.warn(Lost(f"{name}: {missing} images of data.csv are missing in data/"))
     source.files += [path for _, path in frames]
     _add_images(source, name, "ASL camera", frames)
     return source

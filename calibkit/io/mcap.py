@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from calibkit.data.observations import Lost
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Channel, Chunk, Damage, Message, in_time_order, ros_type
 from calibkit.io.unpack import MAX_CHUNK, UnpackError, unpack
@@ -69,7 +70,7 @@ class McapFile:
             counts = self._find_messages(file)
             if not counts and not self._channels:
                 raise BadInputError(f"{self.path.name}: nothing can be saved of this file ({damage}): record it again") from damage
-            self.warnings.insert(0, f"{self.path.name} is damaged ({damage}): {sum(counts.values())} messages saved")
+            self.warnings.insert(0, Lost(f"{self.path.name} is damaged ({damage}): {sum(counts.values())} messages saved"))
         by_channel: Counter[Channel] = Counter()
         for number, channel in self._channels.items():
             by_channel[channel] += counts[number]
@@ -159,7 +160,7 @@ class McapFile:
                     self._define(op, inside[at : at + length])
                 at += length
         except (Damage, UnpackError) as damage:
-            text = f"{self.path.name}: the chunk at byte {position} is damaged ({one_line(damage)})"
+            text = Lost(f"{self.path.name}: the chunk at byte {position} is damaged ({one_line(damage)})")
             if text not in self.warnings:
                 self.warnings.append(text)
         return found

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from calibkit.data.observations import BoardViews, ImageFrame, ImuSamples, PoseSamples
+from calibkit.data.observations import BoardViews, ImageFrame, ImuSamples, Lost, PoseSamples
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
 from calibkit.io import ros_messages, tf_tree
@@ -51,8 +51,9 @@ class Recording:
 
     @property
     def warnings(self) -> list[str]:
-        """What was salvaged, left out or replaced so far; complete once the topics have been read."""
-        return list(dict.fromkeys(one_line(warning, 1000) for source in self._sources for warning in source.warnings))
+        """What was salvaged, left out or replaced so far, damage as `Lost`; complete once the topics have been read."""
+        said = [warning for source in self._sources for warning in source.warnings]
+        return list(dict.fromkeys((Lost if isinstance(text, Lost) else str)(one_line(text, 1000)) for text in said))
 
     @property
     def recorded(self) -> dict[str, int]:

@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from calibkit.data.observations import Lost
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Channel, Chunk, Damage, Message, in_time_order, ros_type
 from calibkit.io.unpack import MAX_CHUNK, UnpackError, unpack
@@ -109,7 +110,7 @@ class Ros1Bag:
             counts = self._find_chunks(file, first)
             if not counts:
                 raise
-            self.warnings.insert(0, f"{self.path.name} is damaged ({damage}): {sum(counts.values())} messages saved")
+            self.warnings.insert(0, Lost(f"{self.path.name} is damaged ({damage}): {sum(counts.values())} messages saved"))
         by_channel: Counter[Channel] = Counter()
         for connection, channel in self._connections.items():
             by_channel[channel] += counts[connection]
@@ -172,7 +173,7 @@ class Ros1Bag:
                 elif op == _MESSAGE and (wanted is None or connection in wanted):
                     messages.append((connection, _time(header, b"time"), body))
         except (Damage, UnpackError) as damage:
-            text = f"{self.path.name}: the chunk at byte {position} is damaged ({one_line(damage)})"
+            text = Lost(f"{self.path.name}: the chunk at byte {position} is damaged ({one_line(damage)})")
             if text not in self.warnings:
                 self.warnings.append(text)
         return messages

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from calibkit.data.observations import Lost
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.container import Container
 from calibkit.io.db3 import Db3File
@@ -75,7 +76,7 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
     listed = [folder / Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
     files = [path for path in listed if is_bag_file(path)]
     if missing := [path.name for path in listed if path not in files]:
-        warnings.append(f"{folder.name}: {len(missing)} files of {METADATA} are missing: {one_line(', '.join(missing), 120)}")
+        warnings.append(Lost(f"{folder.name}: {len(missing)} files of {METADATA} are missing: {one_line(', '.join(missing), 120)}"))
     files = files or sorted(path for path in folder.iterdir() if is_bag_file(path))
     containers, refused = [], []
     for path in files:
@@ -85,11 +86,11 @@ def open_folder(folder: Path) -> tuple[list[Path], list[Container], str | None, 
             refused.append(str(error))
     if not containers:
         raise BadInputError(f"{folder.name} holds no readable bag file: {refused[0] if refused else 'no .mcap, .db3 or .bag in it'}")
-    warnings += refused
+    warnings += map(Lost, refused)
     held = sum(sum(container.counts.values()) for container in containers)
     claimed = metadata.get("message_count")
     if isinstance(claimed, int) and claimed != held:
-        warnings.append(f"{folder.name}: {METADATA} claims {claimed} messages, the data files hold {held}")
+        warnings.append(Lost(f"{folder.name}: {METADATA} claims {claimed} messages, the data files hold {held}"))
     stated = [metadata.get("ros_distro"), *(c.distro for c in containers if isinstance(c, Db3File))]
     distro = next((name for name in stated if name and isinstance(name, str)), None)
     return files, containers, one_line(distro, 40) if distro else None, warnings

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibkit.data.observations import ImageFrame, ImuSamples, PoseSamples
+from calibkit.data.observations import ImageFrame, ImuSamples, Lost, PoseSamples
 from calibkit.data.plural import counted
 from calibkit.data.progress import Progress, silent
 from calibkit.errors import BadInputError, one_line
@@ -50,9 +50,9 @@ class _Bag:
                 else:
                     yield message if payload is message.payload else message._replace(payload=payload)
             if broken:
-                self.source.warn(f"{container.path.name}: {broken} messages are damaged and left out")
+                self.source.warn(Lost(f"{container.path.name}: {broken} messages are damaged and left out"))
             if seen < claimed:
-                self.source.warn(f"{container.path.name} claims {claimed} messages of {_names(topics)} but holds {seen}")
+                self.source.warn(Lost(f"{container.path.name} claims {claimed} messages of {_names(topics)} but holds {seen}"))
             for warning in container.warnings:
                 self.source.warn(warning)
 
@@ -74,7 +74,7 @@ class _Bag:
                 continue
             yield t_ns, decoded
         if broken:
-            self.source.warn(f"{topic}: {broken} damaged messages are left out")
+            self.source.warn(Lost(f"{topic}: {broken} damaged messages are left out"))
 
     def images(self, topic: str) -> Iterator[ImageFrame]:
         return (self._frame(t_ns, message) for t_ns, message in self.stamped(topic))

@@ -3,10 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from calibkit.data.observations import Lost
+from calibkit.data.plural import counted
 from calibkit.data.result import Result
-from calibkit.data.rig import InputFile, Rig, StageRun
-from calibkit.data.verdict import worst
+from calibkit.data.rig import Imu, InputFile, Rig, StageRun
+from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import one_line
 from calibkit.io.atomic import refuse_unwritable, write_json
 from calibkit.io.residual_file import save_residuals
@@ -65,6 +68,38 @@ def with_signals(result: Result) -> Result:
     return replace(result, rig=rig, reasons=tuple(dict.fromkeys(reasons)))
 
 
+def with_losses(result: Result, base: Rig) -> Result:
+    """Return the result with what its recording has lost among its reasons, and those of all that it made: what is left may look well."""
+    warnings = result.facts.get("warnings")
+    lost = [text for text in warnings if isinstance(text, Lost)] if isinstance(warnings, list) else []
+    if not lost:
+        return result
+    more = f" (and {counted(len(lost) - 1, 'warning')} more)" if len(lost) > 1 else ""
+    reason = Reason(Verdict.CHECK, f"{lost[0]}{more}: only what is left was calibrated from; record again if that is too little")
+    rig = result.rig
+    parts = {
+        section: {name: _doubted(entry, getattr(base, section).get(name), reason) for name, entry in getattr(rig, section).items()}
+        for section in ("cameras", "transforms", "time_offsets")
+    }
+    imus = {name: _doubted_imu(imu, base.imus.get(name) or Imu(), reason) for name, imu in rig.imus.items()}
+    return replace(result, rig=rig.model_copy(update={**parts, "imus": imus}), reasons=(*result.reasons, reason))
+
+
+def _doubted(entry: Any, old: Any, reason: Reason) -> Any:
+    """Return the entry with the reason, where a stage has judged it and not taken it over as it was."""
+    if entry is None or entry.verdict is None or entry == old:
+        return entry
+    verdict = worst((reason, Reason(entry.verdict, "")))
+    return entry.model_copy(update={"verdict": verdict, "reasons": [*entry.reasons, one_line(reason.text, 1000)]})
+
+
+def _doubted_imu(imu: Imu, old: Imu, reason: Reason) -> Imu:
+    """Return the IMU: its noise and its intrinsics come from different stages."""
+    noise, noise_was = (each.model_copy(update={"intrinsics": None}) for each in (imu, old))
+    doubted: Imu = _doubted(noise, noise_was, reason)
+    return doubted.model_copy(update={"intrinsics": _doubted(imu.intrinsics, old.intrinsics, reason)})
+
+
 def save(
     result: Result,
     base: Rig,
@@ -73,7 +108,7 @@ def save(
     options: dict[str, str | float | int | bool | None],
 ) -> Saved:
     """Write everything that was asked for; the rig file last but for the report, so that it never names what is not there."""
-    result = with_signals(result)
+    result = with_losses(with_signals(result), base)
     files: list[Path] = []
     run = StageRun(
         stage=result.stage,

@@ -109,6 +109,26 @@ def test_usage_errors_are_one_line(run: Run, boom: Raise, arguments: list[str], 
 
 
 @pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["intrinsics", "a.bag", "--target", "a.yaml", "--target=b.yaml"], "--target is given twice"),
+        (["report", "rig.yaml", "--markdown", "a", "--markdown", "a", "--markdown", "b"], "--markdown is given 3 times"),
+        (["joint", "a.bag", "-o", "a.yaml", "--out", "b.yaml"], "--out is given twice"),
+        (["diagnose", "rig.yaml", "a.bag", "--imu", "/imu0", "--imu", "/imu0"], "--imu is given twice"),
+        (["target", "aprilgrid", "--columns", "6", "--columns", "7"], "--columns is given twice"),
+    ],
+)
+def test_an_option_of_one_value_is_given_once(run: Run, arguments: list[str], option: str) -> None:
+    command = " ".join(arguments[: 1 + (arguments[0] == "target")])
+    assert run(*arguments).mistake == f"{option} and holds one value: keep one of them (see calibkit {command} --help)"
+
+
+def test_flags_and_options_of_several_values_may_be_repeated(run: Run) -> None:
+    said = run("report", "no.yaml", "--strict", "--strict", "--limit", "fx.sigma=1px", "--limit", "fy.sigma=1px")
+    assert said.mistake.startswith("no.yaml: cannot be read")
+
+
+@pytest.mark.parametrize(
     ("error", "code", "line"),
     [
         (BadInputError("a.bag: no topic\n\x1b[31m/cam0; give --camera"), 2, "calibkit: a.bag: no topic [31m/cam0; give --camera"),

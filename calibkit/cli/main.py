@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from calibkit.cli.once import refuse_repeated
 from calibkit.errors import BadInputError, CalibkitError, one_line
 from calibkit.version import __version__
 
@@ -65,6 +66,7 @@ def options(
 # All are imported because --help needs their signatures; what they call is imported when they run.
 for _name in COMMANDS:
     import_module(f"calibkit.cli.{_name}").register(app)
+refuse_repeated(app)
 
 
 def main() -> None:

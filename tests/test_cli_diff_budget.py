@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from commands import Run
 from drawn_rigs import COV_LENS, camera, lens, offset, rig
+from rigs import T_CAM0_IMU0
 
-from calibkit.data.rig import Rig
-from calibkit.data.transforms import make_time_offset
+from calibkit.data.rig import Estimate, Imu, Rig
+from calibkit.data.transforms import make_time_offset, make_transform
+from calibkit.data.verdict import Status
+from calibkit.geometry import se3, so3
 from calibkit.io.rig_file import save_rig
 
 
@@ -74,7 +77,44 @@ def test_a_lens_that_changed_is_told_with_pixels_place_and_z_and_drawn(run: Run,
 def test_the_same_file_twice_is_no_change(run: Run, old: Path) -> None:
     said = run("diff", old, old)
     assert said.code == 0
-    assert said.out.splitlines()[-1] == "nothing changed: all that both have is the same to the last digit"
+    assert said.out == "nothing changed: all that both have is the same to the last digit\n"
+
+
+@pytest.mark.slow
+def test_noise_without_a_sigma_is_told_by_its_ratio_and_what_is_the_same_is_left_out(run: Run, tmp_path: Path) -> None:
+    def noisy(name: str, density: float | None) -> Path:
+        known = {} if density is None else {"gyro_noise_density": Estimate(value=density, unit="rad/s/sqrt(Hz)")}
+        save_rig(rig().model_copy(update={"imus": {"imu0": Imu(topic="/imu0", **known)}}), tmp_path / name)
+        return tmp_path / name
+
+    quiet = noisy("quiet.yaml", 1e-4)
+    said = run("diff", quiet, noisy("loud.yaml", 1e-3))
+    assert (said.code, said.out.splitlines()[-2:]) == (
+        0, ["imu0's gyro_noise_density 10 times: no sigma to judge it by", "nothing could be judged"],
+    )  # fmt: skip
+    assert "\n21 parameters are the same in both and left out\n" in said.out
+    assert "cam0 fx" not in said.out
+    assert "only in OLD: imu0's noise" in run("diff", quiet, noisy("silent.yaml", None)).out
+
+
+@pytest.mark.slow
+def test_a_camera_turned_in_place_did_not_move(run: Run, tmp_path: Path) -> None:
+    def rig_of(name: str, a: str, b: str, T: np.ndarray) -> Path:
+        cov = np.diag([1e-8] * 6)
+        kept = {"imus": {}, "time_offsets": {}, "transforms": {f"T_{a}_{b}": make_transform(a, b, T, cov, Status.DETERMINED)}}
+        save_rig(rig().model_copy(update=kept), tmp_path / name)
+        return tmp_path / name
+
+    turn = se3.make(so3.exp(np.array([0, np.radians(0.5), 0])), np.zeros(3))
+    step = se3.make(np.eye(3), np.array([0.003, 0, 0]))
+    for a, b in (("cam0", "imu0"), ("imu0", "cam0")):  # either way round
+        T_imu_cam = se3.inverse(T_CAM0_IMU0)
+        old, turned, moved = (
+            rig_of(f"{name}_{a}.yaml", a, b, T if a == "imu0" else se3.inverse(T))
+            for name, T in (("old", T_imu_cam), ("turned", T_imu_cam @ turn), ("moved", T_imu_cam @ step))
+        )
+        assert ": cam0 turned by 0.5 deg about its y axis and did not move as imu0 sees it: pixels" in run("diff", old, turned).out
+        assert ": cam0 did not turn and moved by 3 mm as imu0 sees it: pixels" in run("diff", old, moved).out
 
 
 def test_what_only_one_file_has_is_listed(run: Run, old: Path, tmp_path: Path) -> None:

@@ -276,13 +276,47 @@ def test_images_of_another_size_are_a_change() -> None:
     assert found.notes == ("images of 752x480 and 376x240: nothing of the lens can be compared",)
 
 
-def test_one_recording_in_both_is_told_and_one_board_is_not() -> None:
-    def made_from(*names: str) -> Rig:
-        files = [InputFile(name=name, sha256=f"{len(name):064d}") for name in names]
-        return rig().model_copy(update={"provenance": [StageRun(stage="x", command="x", calibkit="0", inputs=files)]})
+def made_from(seed: int, *runs: tuple[str, list[str]]) -> Rig:
+    """A calibration whose stages read these files and made these entries."""
+    provenance = [
+        StageRun(stage="x", command="x", calibkit="0", inputs=[InputFile(name=name, sha256=f"{len(name):064d}")], made=made)
+        for name, made in runs
+    ]
+    return rig(np.random.default_rng(seed)).model_copy(update={"provenance": provenance})
 
-    assert difference(made_from("a.bag", "board.yaml"), made_from("bb.bag", "board.yaml")).notes == ()
-    assert "both were made from a.bag" in difference(made_from("a.bag"), made_from("a.bag")).notes[0]
+
+def test_one_recording_in_both_is_told_of_the_entries_made_from_it_and_one_board_is_not() -> None:
+    old, lens = made_from(1, ("a.bag", [])), ["cameras.cam0"]
+    assert difference(old, made_from(2, ("bb.bag", []))).notes == ()
+    assert difference(made_from(1, ("board.yaml", [])), made_from(2, ("board.yaml", []))).notes == ()
+    assert difference(old, made_from(2, ("a.bag", []))).notes[0].startswith("both were made from a.bag: errors in common")
+    assert difference(old, old).notes == ()  # nothing is judged
+    for name in ("T_cam0_imu0", "T_imu0_cam0"):  # in either direction
+        new = made_from(2, ("a.bag", [*lens, f"transforms.{name}"]), ("bb.bag", lens))
+        assert difference(old, new).notes[0].startswith("both were made from a.bag (T_cam0_imu0): ")
+    every = [
+        *lens,
+        "transforms.T_cam0_imu0",
+        "transforms.T_imu1_imu0",
+        "time_offsets.dt_imu0_cam0",
+        "imus.imu0.noise",
+        "imus.imu0.intrinsics",
+    ]
+    assert difference(old, made_from(2, ("a.bag", every), ("bb.bag", every))).notes == ()
+
+
+@pytest.mark.slow
+def test_parts_of_one_file_alone_are_listed() -> None:
+    imu, cam = rig().imus["imu0"], rig().cameras["cam0"]
+    less = rig().model_copy(update={"imus": {"imu0": imu.model_copy(update={"gyro_random_walk": None, "intrinsics": None})}})
+    assert (difference(less, rig()).only_old, difference(less, rig()).only_new) == (
+        (),
+        ("imu0's gyro_random_walk", "imu0's scale and axes"),
+    )
+    bare = rig().model_copy(update={"imus": {"imu0": Imu(intrinsics=imu.intrinsics)}})
+    assert difference(rig(), bare).only_old == ("imu0's noise",)
+    rolling = cam.model_copy(update={"line_delay": Estimate(value=3e-5, unit="s", sigma=1e-7, status=Status.DETERMINED)})
+    assert difference(rig(), rig().model_copy(update={"cameras": {"cam0": rolling}})).only_new == ("cam0's line delay",)
 
 
 def test_names_are_those_of_the_first_file() -> None:

@@ -270,6 +270,7 @@ class StageRun(Record):
     calibkit: Annotated[str, Field(max_length=40)]
     inputs: list[InputFile] = []
     options: dict[str, str | Finite | int | bool | None] = {}
+    made: Texts = []  # the entries that it made or changed: cameras.cam0, imus.imu0.noise
     residual_file: Text | None = None  # a bare name: the file lies beside the rig file
     residual_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
 

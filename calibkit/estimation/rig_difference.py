@@ -5,7 +5,7 @@ d^T (C_old + C_new)^-1 d, and entries are called changed by Holm's rule (1979), 
 has any entry called so.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import chdtrc, gammaln, ndtri
 
 from calibkit.data.rig import Camera, Imu, ImuIntrinsics, Rig, TimeOffset, Transform
-from calibkit.errors import one_line
 from calibkit.estimation.model_conversion import convert
 from calibkit.estimation.pixel_grid import grid
+from calibkit.estimation.rig_makers import shared_recordings
 from calibkit.estimation.rig_values import Values, named_as, of_estimates, of_transform
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -75,7 +75,7 @@ class EntryChange:
 
 @dataclass(frozen=True)
 class Difference:
-    """All entries that both rigs have, and the names of those that only one has."""
+    """All entries that both rigs have, and the names of those, and of their parts, that only one has."""
 
     entries: tuple[EntryChange, ...]
     only_old: tuple[str, ...]
@@ -94,10 +94,14 @@ def difference(old: Rig, new: Rig) -> Difference:
     entries, only_old, only_new = list[EntryChange](), list[str](), list[str]()
     for section, compare in _SECTIONS.items():
         before, after = getattr(old, section), getattr(turned, section)
-        entries += [found for name in before if name in after for found in compare(name, before[name], after[name])]
+        both = [name for name in before if name in after]
+        entries += [found for name in both for found in compare(name, before[name], after[name])]
         only_old += [name for name in before if name not in after]
         only_new += [name for name in after if name not in before]
-    return Difference(_holm(entries), tuple(only_old), tuple(only_new), turned, _same_recording(old, new))
+        if section in _PARTS:
+            only_old += [part for name in both for part in _PARTS[section](name, before[name], after[name])]
+            only_new += [part for name in both for part in _PARTS[section](name, after[name], before[name])]
+    return Difference(_holm(entries), tuple(only_old), tuple(only_new), turned, _same_recording(old, new, entries))
 
 
 def _holm(entries: list[EntryChange]) -> tuple[EntryChange, ...]:
@@ -257,19 +261,44 @@ def _scale_and_axes(name: str, old: ImuIntrinsics, new: ImuIntrinsics) -> EntryC
     return _judged(name, "scale and axes", before, after)
 
 
-def _same_recording(old: Rig, new: Rig) -> tuple[str, ...]:
-    """Say so where the two share a recording: their errors are then shared, and the sigma of a change is too large."""
-    files = [
-        {file.sha256: one_line(file.name, 80) for run in rig.provenance for file in run.inputs if file.sha256 is not None}
-        for rig in (old, new)
-    ]
-    boards_and_rigs = (".yaml", ".yml")
-    shared = [name for digest, name in files[0].items() if digest in files[1] and not name.endswith(boards_and_rigs)]
-    if not shared:
-        return ()
-    return (f"both were made from {', '.join(shared)}: errors in common cancel, and what differs is judged too mildly",)
+def _camera_parts(name: str, one: Camera, other: Camera) -> Iterator[str]:
+    if one.line_delay is not None and other.line_delay is None:
+        yield f"{name}'s line delay"
 
 
+def _imu_parts(name: str, one: Imu, other: Imu) -> Iterator[str]:
+    mine, its = (_noise(imu, by_axis=bool(one.noise and other.noise)) for imu in (one, other))
+    yield from _names(name, "noise", mine.names, its.names)
+    mine_, its_ = ([] if imu.intrinsics is None else list(imu.intrinsics.parameters) for imu in (one, other))
+    yield from _names(name, "scale and axes", mine_, its_)
+
+
+def _names(entry: str, what: str, mine: Sequence[str], its: Sequence[str]) -> Iterator[str]:
+    """Yield the numbers that one alone has, all as one where the other has none."""
+    yield from (f"{entry}'s {key}" for key in mine if key not in its) if its or not mine else [f"{entry}'s {what}"]
+
+
+def _same_recording(old: Rig, new: Rig, entries: Iterable[EntryChange]) -> tuple[str, ...]:
+    """Say so where entries were made from one recording: their errors are shared, and the sigma of a change is too large."""
+    names = {_KEYS[entry.what].format(entry.name): entry.name for entry in entries if entry.chi2 is not None}
+    shared = shared_recordings(old, new, names)
+    said = []
+    for recording, keys in shared.items():
+        which = list(dict.fromkeys(names[key] for key in keys))
+        of = "" if len(keys) == len(names) else f" ({', '.join(which)})"
+        said.append(f"both were made from {recording}{of}: errors in common cancel, and what differs is judged too mildly")
+    return tuple(said)
+
+
+_KEYS = {  # of what a stage made
+    "lens": "cameras.{}",
+    "line delay": "cameras.{}",
+    "transform": "transforms.{}",
+    "time offset": "time_offsets.{}",
+    "noise": "imus.{}.noise",
+    "scale and axes": "imus.{}.intrinsics",
+}
+_PARTS: Mapping[str, Callable[[str, Any, Any], Iterator[str]]] = {"cameras": _camera_parts, "imus": _imu_parts}  # what one alone may have
 _SECTIONS: Mapping[str, Callable[[str, Any, Any], Iterator[EntryChange]]] = {
     "cameras": _cameras,
     "transforms": _transforms,

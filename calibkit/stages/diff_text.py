@@ -6,6 +6,7 @@ from math import degrees, isfinite
 import numpy as np
 
 from calibkit.data.plural import counted, plain
+from calibkit.data.transforms import frames_of
 from calibkit.data.verdict import Status
 from calibkit.errors import one_line
 from calibkit.estimation.pixel_shift import Shift
@@ -13,19 +14,28 @@ from calibkit.estimation.rig_difference import FALSE_ALARM, Change, Difference, 
 from calibkit.estimation.time_offset_result import smear
 from calibkit.estimation.view_advice import region_of
 from calibkit.geometry import so3
+from calibkit.geometry.so3 import Array
 from calibkit.report.columns import columns, range_text, sized
 from calibkit.report.parameters import Row, decimals, number
 
 _PARAMETERS = ("parameter", "old", "new", "change", "sigma", "z", "unit", "")
 _ENTRIES = ("entry", "chi-squared", "of", "chance", "z", "", "")
+_ALL_THE_SAME = "nothing changed: all that both have is the same to the last digit"
+_ALONG = np.cos(np.radians(10))
+_NOTHING = 1e-7  # m, rad: rounding
+_NAMED = 4  # numbers that differ and cannot be judged
 _SHIFTS = ("pixel shift", "", "range", "worst", "where", "rms")
 
 
 def text(found: Difference, shifts: Mapping[str, list[Shift]]) -> str:
     """Return the tables, then the verdict."""
-    rows = [_parameter(entry, each) for entry in found.entries for each in entry.parameters]
+    if not found.only_old and not found.only_new and all(entry.same for entry in found.entries):
+        return _ALL_THE_SAME
+    rows = [_parameter(entry, each) for entry in found.entries for each in entry.parameters if each.change != 0]
+    left = sum(len(entry.parameters) for entry in found.entries) - len(rows)
     moved = [_shift(name, shift) for name, each in shifts.items() for shift in each]
     tables = [columns([_PARAMETERS, *rows])] if rows else []
+    tables += [f"{counted(left, 'parameter is', 'parameters are')} the same in both and left out"] if left else []
     tables.append(columns([_ENTRIES, *(_entry(entry) for entry in found.entries)]))
     tables += [columns([_SHIFTS, *moved])] if moved else []
     return "\n".join("\n\n".join([*tables, "\n".join(_verdict(found, shifts))]).splitlines())
@@ -68,16 +78,34 @@ def _verdict(found: Difference, shifts: Mapping[str, list[Shift]]) -> Iterator[s
     for entry in found.entries:
         if entry.changed:
             yield f"{entry.name}: {_SAID[entry.what](entry, shifts.get(entry.name, []), found)}{_as_a_whole(entry)}"
+    yield from (line for entry in found.entries for line in _unjudged(entry))
     if found.changed:
         return
     judged = sum(entry.chi2 is not None for entry in found.entries)
     if all(entry.same for entry in found.entries):
-        yield "nothing changed: all that both have is the same to the last digit"
+        yield _ALL_THE_SAME
     elif judged:
         alarms = f"a false alarm in any of them: {FALSE_ALARM:.0%}"
         yield f"nothing changed beyond chance: {counted(judged, 'entry', 'entries')} judged ({alarms})"
     else:
         yield "nothing could be judged"
+
+
+def _unjudged(entry: EntryChange) -> Iterator[str]:
+    """Yield the numbers that differ and have no sigma in either file; lenses of two models have no number in common."""
+    differ = [each for each in entry.parameters if each.change and each.sigma is None and not each.note.endswith("not judged")]
+    if not differ:
+        return
+    texts = [f"{each.name} {_times(entry, each)}" for each in differ[:_NAMED]]
+    more = f" and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
+    yield f"{entry.name}'s {', '.join(texts)}{more}: no sigma to judge {'it' if len(differ) == 1 else 'them'} by"
+
+
+def _times(entry: EntryChange, each: Change) -> str:
+    """Return how much a number differs: a noise by its ratio."""
+    if entry.what == "noise" and each.old and each.new:
+        return f"{each.new / each.old:.3g} times"
+    return f"{_signed(each.change or 0.0, None)} {one_line(each.unit)}".rstrip()
 
 
 def _as_a_whole(entry: EntryChange) -> str:
@@ -93,21 +121,40 @@ def _lens(entry: EntryChange, shifts: list[Shift], found: Difference) -> str:
 
 
 def _transform(entry: EntryChange, shifts: list[Shift], found: Difference) -> str:
-    p, r = entry.parameters[:3], entry.parameters[3:]
-    parts = []
-    if all(each.change is not None for each in r):
-        old, new = (np.array([getattr(each, when) for each in r]) for when in ("old", "new"))
-        angle = float(np.linalg.norm(so3.log(so3.exp(-old) @ so3.exp(new))))
-        parts.append(f"turned by {degrees(angle):.2g} deg")
-    moved = [each.change for each in p if each.change is not None]
-    if len(moved) == len(p):
-        parts.append(f"moved by {sized(float(np.linalg.norm(moved)), 'm')}")
+    a, b = frames_of(entry.name)
+    body, other = (b, a) if b in found.new.cameras and a not in found.new.cameras else (a, b)
+    parts = _motion(entry, of_b=body == b)
+    said = f"{body} {' and '.join(parts)} as {other} sees it" if parts else "changed"
     cost = [
         f"{sized(shift.worst[0], 'px')} {'at ' if isfinite(shift.range_m) else ''}{range_text(shift.range_m)}"
         for shift in shifts
         if shift.what.endswith("alone")
     ]
-    return " and ".join(parts or ["changed"]) + (f": pixels move by up to {', '.join(cost)}" if cost else "")
+    return said + (f": pixels move by up to {', '.join(cost)}" if cost else "")
+
+
+def _motion(entry: EntryChange, of_b: bool) -> list[str]:
+    """Return how b of T_a_b (or a) turned, in its own axes, and how far its origin moved in the other's; what is known of it."""
+    then, now = (np.array([np.nan if (x := getattr(each, when)) is None else x for each in entry.parameters]) for when in ("old", "new"))
+    R_then, R_now = (so3.exp(x[3:]) if of_b else so3.exp(-x[3:]) for x in (then, now))  # R_other_body
+    shift = now[:3] - then[:3] if of_b else R_then @ then[:3] - R_now @ now[:3]  # p_b_a = -R^T p_a_b
+    parts = []
+    if np.isfinite(then[3:]).all() and np.isfinite(now[3:]).all():
+        turn = so3.log(R_then.T @ R_now)
+        angle = float(np.linalg.norm(turn))
+        parts.append(f"turned by {degrees(angle):.2g} deg about its {_axis(turn / angle)}" if angle > _NOTHING else "did not turn")
+    if np.isfinite(shift).all():
+        length = float(np.linalg.norm(shift))
+        parts.append(f"moved by {sized(length, 'm')}" if length > _NOTHING else "did not move")
+    return parts
+
+
+def _axis(axis: Array) -> str:
+    """Return a unit vector in words: the nearest of x, y, z within 10 degrees, else its numbers."""
+    i = int(np.argmax(np.abs(axis)))
+    if abs(axis[i]) > _ALONG:
+        return f"{'-' if axis[i] < 0 else ''}{'xyz'[i]} axis"
+    return f"axis ({', '.join(f'{x:.2f}' for x in axis)})"
 
 
 def _time(entry: EntryChange, shifts: list[Shift], found: Difference) -> str:

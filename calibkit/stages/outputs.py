@@ -12,7 +12,7 @@ from calibkit.data.rig import Imu, InputFile, Rig, StageRun
 from calibkit.data.verdict import Reason, Verdict, worst
 from calibkit.errors import one_line
 from calibkit.io.atomic import refuse_unwritable, write_json
-from calibkit.io.residual_file import save_residuals
+from calibkit.io.residual_file import entry_hashes, save_residuals
 from calibkit.io.rig_file import load_rig, merge_rigs, save_rig, updated
 from calibkit.report.signals import measure, not_good
 from calibkit.report.summary import Summary, as_json, summarise
@@ -100,6 +100,11 @@ def _doubted_imu(imu: Imu, old: Imu, reason: Reason) -> Imu:
     return doubted.model_copy(update={"intrinsics": _doubted(imu.intrinsics, old.intrinsics, reason)})
 
 
+def _made(rig: Rig, base: Rig) -> list[str]:
+    before = entry_hashes(base)
+    return [key for key, digest in entry_hashes(rig).items() if before.get(key) != digest]
+
+
 def save(
     result: Result,
     base: Rig,
@@ -116,6 +121,7 @@ def save(
         calibkit=__version__,
         inputs=[InputFile(name=one_line(name), sha256=digest) for name, digest in inputs],
         options=options,
+        made=_made(result.rig, base),
     )
     if outputs.out is not None:
         name, digest = save_residuals(result, outputs.out)

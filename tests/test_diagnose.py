@@ -216,6 +216,30 @@ def test_a_lens_that_bends_otherwise_is_told_by_what_turning_and_focusing_anew_l
     assert f"corners are off by {np.sqrt(np.mean(np.sum(found**2, axis=1))):.2g} px rms" in told.text
 
 
+@pytest.mark.parametrize(
+    ("axis", "said", "point", "seen"),
+    [
+        ("x", "up", (0, 0, 1), (0, 1)),  # who looks up sees what was ahead lower in the image, y points down
+        ("y", "to the right", (0, 0, 1), (-1, 0)),
+        ("z", "clockwise", (1, 0, 1), (0, -1)),  # turned clockwise, the image turns back
+    ],
+)
+def test_which_way_a_camera_has_turned(axis: str, said: str, point: tuple[float, ...], seen: tuple[int, int]) -> None:
+    """T_imu_cam' = T_imu_cam exp(w): the camera stays where it is, and the words are what somebody behind it sees."""
+    rng = np.random.default_rng(0)
+    T = se3.make(so3.exp(rng.standard_normal(3)), rng.standard_normal(3))
+    w = 0.01 * np.eye(3)["xyz".index(axis)]
+    turned = se3.retract(T, mount(T)[0] @ w)
+    np.testing.assert_allclose(se3.inverse(turned), se3.inverse(T) @ se3.make(so3.exp(w), np.zeros(3)), atol=1e-4)
+    before = np.array(point, float)
+    after = se3.transform(turned @ se3.inverse(T), before[None])[0]
+    assert np.sign(np.round(after[:2] - before[:2], 3)).tolist() == list(seen)
+    about = About(("cam0",), "imu0", (CAMERAS["pinhole-radtan"],), (np.ones(8),), (np.zeros((0, 2)),))
+    for sign in (1, -1):
+        cause = Cause(f"R_{axis} 0", sign * np.array([0.01]), np.array([[1e-8]]), -50.0, 1.0)
+        assert (f"cam0 is turned {said} by 0.5730 +- 0.0057 deg about its own {axis} axis" in in_words(cause, about).text) == (sign > 0)
+
+
 def test_causes_beyond_all_doubt_are_still_ranked() -> None:
     """Chances below the smallest number: of two degrees of freedom they are x^(f/2) exactly."""
     for chi2, freedom in ((3.0, 10.0), (1e5, 600.0), (5000.0, 1e5)):

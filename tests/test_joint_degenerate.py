@@ -45,14 +45,21 @@ def opened(result: Result) -> list[str]:
 def to_add(result: Result) -> list[str]:
     lines = result.facts["lines"]
     assert isinstance(lines, list)
-    heads = [i for i, line in enumerate(lines) if "to determine all, add, for 10 s each:" in line]
+    heads = [i for i, line in enumerate(lines) if "to determine T and dt, add, for 10 s each:" in line]
     return [line.strip() for i in heads for line in lines[i + 1 :]]
+
+
+def two_turns(result: Result) -> bool:
+    """Whether turns about two axes are asked for: one leaves the lever arm along it open."""
+    first, *rest = to_add(result)
+    return "turn it" in first and "something is open still" in first and len(rest) == 1 and "T and dt are determined then" in rest[0]
 
 
 def translation(recording: Recording, joint: Joint, result: Result) -> None:
     """The lever arm alone: accelerations tell rotation and offset."""
     assert unknown(result) == set(P)
     assert len(opened(result)) == 3
+    assert two_turns(result)
     assert all(f"p of {T} along" in text and "turn about" in text for text in opened(result))
     assert right(recording, joint, slice(3, 7))
     assert abs(joint.fit.x.cameras[0].dt - recording.td) < 5e-4
@@ -75,7 +82,7 @@ def planar(recording: Recording, joint: Joint, result: Result) -> None:
     assert len(texts) == 1
     assert f"p of {T} along the imu0's x axis" in texts[0]
     assert len(to_add(result)) == 1
-    assert re.match(r"turn it about the camera's [xz] axis .* \(all is determined then\)", to_add(result)[0])  # across its turns
+    assert re.match(r"turn it about the camera's [xz] axis .* \(T and dt are determined then\)", to_add(result)[0])  # across its turns
     assert unknown(result) == {"p_y"}
     assert right(recording, joint, slice(3, 7))
 
@@ -84,6 +91,7 @@ def nothing(recording: Recording, joint: Joint, result: Result) -> None:
     """At rest and gliding: nothing at all."""
     assert unknown(result) == {*P, *R, "offset"}
     assert len(opened(result)) == 6
+    assert two_turns(result)
     assert "repeats itself" not in str(result.reasons)
     assert result.rig.time_offsets[DT].offset.value is None
 

@@ -59,6 +59,6 @@ def test_the_command_says_what_to_add(run: Run, tmp_path: Path) -> None:
     assert said.code == 3, said
     assert "p of T_cam0_imu0 along the imu0's x axis is not observable" in said.out
     assert "add, for 10 s each:" in said.out
-    assert "(all is determined then)" in said.out
+    assert "(T and dt are determined then)" in said.out
     assert said.out.splitlines()[-2] == "NOT OBSERVABLE: this motion does not tell all of the calibration"
     assert '"motion": "turn it about the camera\'s ' in js.read_text()

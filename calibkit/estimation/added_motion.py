@@ -20,10 +20,11 @@ from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots, Steps
 from calibkit.solver.arrowhead import Arrowhead
-from calibkit.solver.trust import DETERMINED
+from calibkit.solver.trust import DETERMINED, WEAK
 
 DURATION_S, HZ = 10.0, 1.0
 TURN_RAD, MOVE_M = np.radians(25.0), 0.08  # each way, at HZ: 2.7 rad/s and 3.2 m/s^2 at the most
+_ROUNDING, _NOTHING = 1e-13, 1e-26  # of information: what is less than the first is the second
 _HELPS = 0.8  # of the worst sigma, at least
 _MARGIN_S = 0.1  # frames so near the ends of the motion are left out
 _INSIDE_PX = 5.0  # of the image's edge
@@ -47,11 +48,14 @@ def missing_motions(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
 
 def in_words(motions: Sequence[AddedMotion]) -> list[str]:
     """Return each motion with what is known once it is added, too."""
-    known = (
-        "all is determined then" if each.left <= DETERMINED else f"the worst is known to {each.left:.0f} times 1 mm, 1 mrad, 0.1 ms then"
-        for each in motions
-    )
+    known = ("T and dt are determined then" if each.left <= DETERMINED else _left(each.left) for each in motions)
     return [f"{each.text} ({then})" for each, then in zip(motions, known, strict=True)]
+
+
+def _left(worst_sigma: float) -> str:
+    if worst_sigma > WEAK:
+        return "something is open still"
+    return f"the worst is known to {worst_sigma:.0f} times 1 mm, 1 mrad, 0.1 ms then"
 
 
 def _missing(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
@@ -83,7 +87,11 @@ def _simple() -> Iterator[tuple[str, Array, Array]]:
 
 
 def _covariance(information: Array, trust: Trust) -> Array:
-    out: Array = trust.scales[:, None] * np.linalg.pinv(information, rcond=1e-15, hermitian=True) * trust.scales
+    """Return the inverse; what the information does not hold is open, and not known as a pseudo-inverse has it."""
+    root = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information * root[:, None] * root)
+    F = (trust.scales * root)[:, None] * vectors / np.sqrt(np.where(values > _ROUNDING, values, _NOTHING))
+    out: Array = F @ F.T
     return out
 
 

@@ -86,7 +86,8 @@ def diagnose(evidence: Evidence, suspects: Sequence[Suspect]) -> Diagnosis:
         if not tests or min(tests.values()) > limit:
             break
         best = min(tests, key=lambda key: tests[key])
-        alike[best] = tuple(key for key in tests if key != best and tried[key] > tried[best] - _AS_GOOD and tests[key] < limit)
+        near = (key for key in tests if key != best and tried[key] > tried[best] - _AS_GOOD and tests[key] < limit)
+        alike[best] = tuple(key for key in near if not _holds(columns[key], columns[best]))
         log_p[best] = tests[best]
         chosen.append(best)
         for key in chosen[:-1]:  # one that the others explain was none
@@ -162,6 +163,12 @@ class _Scaled:
         cov = np.linalg.pinv(column.T @ self.M @ column, hermitian=True)
         size = np.linalg.norm(column, axis=0)
         return float(np.max(np.sqrt(np.diag(cov)) * size))
+
+
+def _holds(wide: Array, narrow: Array) -> bool:
+    """Whether one suspect is a case of another, which then explains all that it does."""
+    left = narrow - wide @ np.linalg.lstsq(wide, narrow, rcond=None)[0]
+    return bool(np.linalg.norm(left) < 1e-9 * np.linalg.norm(narrow))
 
 
 def log_tail(chi2: float, d: int, freedom: float) -> float:

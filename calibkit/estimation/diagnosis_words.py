@@ -12,6 +12,8 @@ from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CameraModel
 
 _TURNS = {"x": "pitch", "y": "yaw", "z": "roll"}
+# Right-handed turns about x to the right, y down and z forward, and those the other way, as seen from behind the camera.
+_WAYS = {"x": ("up", "down"), "y": ("to the right", "to the left"), "z": ("clockwise", "counter-clockwise")}
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,8 @@ def _offset(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str
 
 def _turn(axis: str) -> Say:
     def say(camera: str, imu: str, theta: Array, size: str, drifts: bool) -> str:
-        way = "about" if theta[0] > 0 else "the other way about"
-        return f"{camera} {'creeps' if drifts else 'is turned'} by {size} {way} its own {axis} axis ({_TURNS[axis]})"
+        way = _WAYS[axis][0 if theta[0] > 0 else 1]
+        return f"{camera} {'creeps' if drifts else 'is turned'} {way} by {size} about its own {axis} axis ({_TURNS[axis]})"
 
     return say
 
@@ -139,6 +141,7 @@ _SAYINGS: dict[str, tuple[str, float, Say, str]] = {
     **{f"R_{axis}": ("deg", float(np.degrees(1)), _turn(axis), _MOUNT) for axis in "xyz"},
     **{f"p_{axis}": ("mm", 1e3, _shift(axis), _MOUNT) for axis in "xyz"},
     "focal": ("px", 1.0, _length, _LENS),
+    "focal lengths": ("px", 1.0, _plain("{camera}'s fx and fy have changed by ({size}), each by its own"), _LENS),
     "centre": ("px", 1.0, _plain("the centre of {camera}'s lens has moved by ({size})"), _LENS),
     "distortion": ("", 1.0, _plain("{camera}'s lens bends otherwise than its distortion says"), _LENS),
     "line delay": (
@@ -178,6 +181,7 @@ _NAMES = {
     **{f"R_{axis}": f"{{camera}}'s {word}" for axis, word in _TURNS.items()},
     **{f"p_{axis}": f"{{camera}} along {{imu}}'s {axis} axis" for axis in "xyz"},
     "focal": "{camera}'s focal length",
+    "focal lengths": "{camera}'s fx and fy",
     "centre": "{camera}'s centre",
     "distortion": "{camera}'s distortion",
     "line delay": "{camera}'s line delay",

@@ -314,7 +314,7 @@ def _noise_line(joint: Joint, of: str, j: int) -> str:
 def _to_add(judged: Judged, motions: Sequence[AddedMotion]) -> list[str]:
     if not motions or judged.contradicted:
         return []
-    return [f"  to determine all, add, for {DURATION_S:.0f} s each:", *(f"    {text}" for text in in_words(motions))]
+    return [f"  to determine T and dt, add, for {DURATION_S:.0f} s each:", *(f"    {text}" for text in in_words(motions))]
 
 
 def _corner_sigma(joint: Joint, c: int) -> float:

@@ -87,6 +87,7 @@ def _suspects(fit: JointFit) -> list[Suspect]:
         focal = camera.lens[:2] / camera.lens[:2].mean()
         found += [
             Suspect(f"focal {c}", lens[:, :2] @ focal[:, None]),
+            Suspect(f"focal lengths {c}", lens[:, :2]),
             Suspect(f"centre {c}", lens[:, 2:4]),
             Suspect(f"line delay {c}", unit[:, border[f"{LINE} {c}"]]),
         ]
@@ -136,7 +137,7 @@ def _rms(rows: Array) -> float:
 def mount(T_cam_imu: Array) -> tuple[Array, Array]:
     """Return the steps (6, 3) of T_cam_imu as the camera turns in place about its own axes, by radian, and moves along the IMU's, by metre.
 
-    T' = exp(w) T about the camera's centre: phi = R^T w, rho = R^T (w x p); the centre -R^T p moved by m: rho = -m.
+    T_imu_cam' = T_imu_cam exp(w), so T' = exp(-w) T: phi = -R^T w, rho = R^T (p x w); the centre -R^T p moved by m: rho = -m.
     """
     R, p = T_cam_imu[:3, :3], T_cam_imu[:3, 3]
-    return np.concatenate([-R.T @ so3.hat(p), R.T]), np.concatenate([-np.eye(3), np.zeros((3, 3))])
+    return np.concatenate([R.T @ so3.hat(p), -R.T]), np.concatenate([-np.eye(3), np.zeros((3, 3))])

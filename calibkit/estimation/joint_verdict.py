@@ -303,6 +303,9 @@ def _of_samples(joint: Joint, i: int, kind: str, imu: str, j: int) -> list[Reaso
         than = "its noise density says" if joint.imus[j].densities[i] else "its samples scatter from one to the next"
         text = f"{imu}'s {WORDS[kind]} is {factor:.1f} times noisier than {than}: vibration, a wrong unit or density?"
         found.append(Reason(Verdict.FAIL if factor > fail else Verdict.CHECK, text))
+    if factor < 1 / check and joint.imus[j].densities[i]:
+        text = f"{imu}'s {WORDS[kind]} is {1 / factor:.1f} times less noisy than its noise density says: another unit, or inflated?"
+        found.append(Reason(Verdict.CHECK, f"{text} White noise is weighed as it is, its random walk is not"))
     lost = 1 - float(np.mean(joint.fit.problem.imus[j].keep[:, i]))
     if lost > _LOST:
         verdict = Verdict.FAIL if lost > _MOSTLY_LOST else Verdict.CHECK

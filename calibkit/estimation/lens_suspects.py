@@ -80,7 +80,8 @@ def _suspects(fit: LensFit, numbers: Sequence[int], placed: Sequence[bool]) -> l
     for c, (k, lens, where) in enumerate(zip(numbers, fit.state.lenses, problem.lens_slices, strict=True)):
         columns = unit[:, where]
         focal = lens[:2] / lens[:2].mean()
-        found += [Suspect(f"focal {k}", columns[:, :2] @ focal[:, None]), Suspect(f"centre {k}", columns[:, 2:4])]
+        found += [Suspect(f"focal {k}", columns[:, :2] @ focal[:, None]), Suspect(f"focal lengths {k}", columns[:, :2])]
+        found += [Suspect(f"centre {k}", columns[:, 2:4])]
         found += [Suspect(f"distortion {k}", columns[:, 4:])] if columns.shape[1] > 4 else []
         if c and placed[c]:
             at, T = unit[:, problem.rig_slice(c)], fit.state.T_cam_cam0[c]

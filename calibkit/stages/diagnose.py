@@ -27,7 +27,9 @@ from calibkit.stages.camera_imu import CameraImu, Sensors, read_camera_imu
 _A_MINUTE_S, _TEN_K = 60.0, 10.0
 _NOISIER = 1.4  # than it was: twice the variance
 _HIDES = 1.2  # times the noise: who sees it may raise R
-_LEFT = 0.2  # of the excess, beside the causes
+_LEFT, _MOSTLY_LEFT = 0.2, 0.5  # of the excess, beside the causes
+_QUIETER = 1 / 3  # than its density: what is so wrong is worth a word, though it harms little
+_NO_FIT, _NO_FIT_PX = 4.0, 0.5  # times the rms at its calibration, and px
 _LEAST_K = 1.0  # of temperature, that something may go with it
 
 
@@ -44,6 +46,7 @@ class Noise:
 
     text: str
     factor: float
+    no_fit: bool = False  # so much that no calibration of this model fits
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,12 @@ class Diagnosed:
     rms: tuple[Rms, ...]
     warnings: tuple[str, ...]
     again: str = "joint"  # the command that calibrates anew
+    beside: tuple[str, ...] = ()  # entries of the rig file that such a recording cannot test
+
+    @property
+    def left(self) -> float:
+        """Return the share of the excess that is no single cause's."""
+        return 1 - sum(cause.share for cause in self.diagnosis.causes)
 
     @property
     def text(self) -> str:
@@ -77,9 +86,11 @@ class Diagnosed:
         for cause, told in zip(self.diagnosis.causes, self.told, strict=True):
             out += ["", f"  {told.text} ({100 * cause.share:.0f} % of the excess)", f"    {told.mend}"]
             out += [f"    this motion does not tell it from: {', '.join(told.alike)}"] if told.alike else []
-        left = 1 - sum(cause.share for cause in self.diagnosis.causes)
-        if self.told and left > _LEFT:
-            out += ["", f"  {100 * left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit {self.again} again"]
+        if self.told and self.left > _LEFT:
+            out += [
+                "",
+                f"  {100 * self.left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit {self.again} again",
+            ]
         out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
         out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
         return "\n".join([*out, "", self.verdict])
@@ -92,6 +103,11 @@ class Diagnosed:
     @property
     def verdict(self) -> str:
         """Return the answer in one line."""
+        if no_fit := [noise.text for noise in self.noise if noise.no_fit]:
+            return f"FAIL: {no_fit[0]}"
+        if self.told and self.left > _MOSTLY_LEFT:
+            misses = f"the calibration misses this recording, and {100 * self.left:.0f} % of it is no single cause's"
+            return f"FAIL: {misses}: run calibkit {self.again} again; what follows may be blamed wrongly: {self.told[0].text}"
         if self.told:
             worst = max(self.rms, key=lambda rms: rms.held / rms.best)
             hide = f": noise of {worst.held:.2g} {worst.unit} for {worst.sensor} would hide it" if worst.held > _HIDES * worst.best else ""
@@ -99,7 +115,15 @@ class Diagnosed:
         if self.unexplained:
             misses = "the calibration misses this recording by more than its sigmas, for no single cause"
             return f"CHECK: {misses}: run calibkit {self.again} again"
-        return "PASS: the calibration fits this recording within its own uncertainty" + (", but for its noise" if self.noise else "")
+        return (
+            "PASS: the calibration fits this recording within its own uncertainty"
+            + (", but for its noise" if self.noise else "")
+            + self._not_asked
+        )
+
+    @property
+    def _not_asked(self) -> str:
+        return f"; {', '.join(self.beside)}: not tested without an IMU" if self.beside else ""
 
     def as_json(self) -> dict[str, object]:
         """Return everything, for machines."""
@@ -122,7 +146,7 @@ class Diagnosed:
             ],
             "unexplained": self.unexplained,
             "noise": [{"text": each.text, "factor": each.factor} for each in self.noise],
-            "not_tested": list(self.untested),
+            "not_tested": [*self.untested, *self.beside],
             "rms": [{"sensor": each.sensor, "unit": each.unit, "by_rig": each.held, "at_best": each.best} for each in self.rms],
             "warnings": list(self.warnings),
         }
@@ -130,7 +154,7 @@ class Diagnosed:
     @property
     def exit_code(self) -> int:
         """SPEC section 6: 1 where a cause is found."""
-        return 1 if self.diagnosis.causes else 0
+        return 1 if self.diagnosis.causes or any(noise.no_fit for noise in self.noise) else 0
 
 
 @dataclass(frozen=True)
@@ -239,17 +263,22 @@ def _what(joint: Joint, read: CameraImu) -> str:
 
 
 def _noise(rms: Sequence[Rms], joint: Joint, read: CameraImu) -> tuple[Noise, ...]:
-    """Return what scatters more than the rig file has it, with everything free."""
+    """Return what scatters more than the rig file has it, with everything free, and IMUs that scatter far less."""
     found = list(noisier_corners(read.names, read.lenses, rms[: len(read.names)]))
     known = read.imu.known
     for kind, density, word in (
         ("gyro", known.gyro_noise_density, "gyroscope"),
         ("accel", known.accel_noise_density, "accelerometer"),
     ):
-        if density is not None and density.value and (factor := joint.fit.factors[kind]) > _NOISIER:
-            real = factor * density.value
-            text = f"{read.imu.name}'s {word} is {factor:.1f} times noisier than its density in the rig file"
-            found.append(Noise(f"{text}: {real:.2e} {density.unit}. Vibration?", factor))
+        if density is None or not density.value:
+            continue
+        factor, name = joint.fit.factors[kind], f"{read.imu.name}'s {word}"
+        real = f"{factor * density.value:.2e} {density.unit}"
+        if factor > _NOISIER:
+            found.append(Noise(f"{name} is {factor:.1f} times noisier than its density in the rig file: {real}. Vibration?", factor))
+        if factor < _QUIETER:
+            text = f"{name} is {1 / factor:.1f} times less noisy than its density in the rig file: {real}. Another unit, or inflated?"
+            found.append(Noise(text, factor))
     return tuple(found)
 
 
@@ -260,5 +289,8 @@ def noisier_corners(names: Sequence[str], lenses: Sequence[Camera], rms: Sequenc
         now = each.best
         if lens.reprojection is not None and lens.reprojection.rms_px > 0 and (factor := now / lens.reprojection.rms_px) > _NOISIER:
             text = f"{name}'s corners scatter by {now:.3g} px, {factor:.1f} times what they did at its calibration, whatever the motion"
-            found.append(Noise(f"{text}: noise; its R is {now:.2g} px now. Blur, light, or another lens or board?", factor))
+            no_fit = factor > _NO_FIT and now > _NO_FIT_PX
+            why = "no lens of its model fits them: another camera, board file, or blur? Run calibkit intrinsics"
+            usual = f"noise; its R is {now:.2g} px now. Blur, light, or another lens or board?"
+            found.append(Noise(f"{text}: {why if no_fit else usual}", factor, no_fit))
     return tuple(found)

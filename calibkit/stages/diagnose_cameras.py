@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from calibkit.data.progress import Progress
 from calibkit.data.rig import Camera, Rig
+from calibkit.data.transforms import frames_of
 from calibkit.errors import NotConvergedError
 from calibkit.estimation.camera_rig_seed import components, match_instants
 from calibkit.estimation.diagnosis import diagnose
@@ -80,6 +81,7 @@ def diagnose_cameras(sources: Sequence[Path], target: Path, rig: Rig, sensors: S
         of_rms,
         tuple(read.warnings),
         "intrinsics",
+        tuple(name for name in (*rig.transforms, *rig.time_offsets) if not set(frames_of(name)) <= set(read.names)),
     )
     return CamerasExamined(read, rig, tuple(fits), about, diagnosed)
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _BARS = 14
 _WORTH_A_PANEL = 0.02  # of what a cause predicts in all
-_LENS = ("focal", "centre", "distortion")
+_LENS = ("focal", "focal lengths", "centre", "distortion")
 
 
 def write_diagnosis(found: Examined, folder: Path, command: str) -> None:

@@ -43,7 +43,7 @@ class Observability:
             table.append([f"{row.part} {row.name}", sigma, row.unit, "" if row.status is None else row.status.value])
         out = [self.what, "", columns(table), ""]
         out += [f"  {reason.verdict.value} {reason.text}" for reason in self.reasons]
-        out += ["", f"add, for {DURATION_S:.0f} s each:"] if self.motions else []
+        out += ["", f"to determine T and dt, add, for {DURATION_S:.0f} s each:"] if self.motions else []
         out += [f"  {text}" for text in in_words(self.motions)]
         return "\n".join([*out, "", self.verdict])
 

@@ -8,11 +8,13 @@ import numpy as np
 
 from calibkit.data.progress import Progress, silent
 from calibkit.data.rig import Rig
+from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.joint_checks import Checks, Halves, check_joint
 from calibkit.estimation.joint_suspects import left_by_sensor
 from calibkit.estimation.speed_sweep import Sweep, sweep
 from calibkit.geometry.spline import Steps, basis, turning
 from calibkit.report.columns import columns
+from calibkit.stages.camera_imu import has_imu
 from calibkit.stages.diagnose import Diagnosed, Examined, Options, examine, sensors_of
 
 APART = 4.5  # sigmas of halves, of gravity and of the board's size
@@ -102,6 +104,9 @@ def validate(sources: Sequence[Path], target: Path, rig: Rig, options: Options |
 
     Errors as `stages.diagnose.examine` has them.
     """
+    if not has_imu(sources, options or Options()):
+        names = ", ".join(one_line(source.name) for source in sources)
+        raise BadInputError(f"{names}: no IMU in it: validate asks cameras and an IMU together; calibkit diagnose tests cameras alone")
     found = examine(sources, target, rig, options, progress)
     checks = check_joint(found.joint.fit)
     sweeps = _sweeps(found)

@@ -137,6 +137,7 @@ def test_what_is_not_known_breaks_every_limit_on_it(dt, why):
         ("reprojecton_rms=1px", "nothing in this rig is called reprojecton_rms; did you mean reprojection_rms?"),
         ("cam1.reprojection_rms=1px", "nothing in this rig is called cam1.reprojection_rms; did you mean cam0.reprojection_rms?"),
         ("T_imu0_cam0.p.sigma=1mm", "did you mean T_cam0_imu0.p.sigma?"),
+        ("T_gripper_cam0.p.sigma=1mm", "did you mean T_cam0_imu0.p.sigma?"),
         ("td=1ms", "did you mean"),
         ("pose_turn=1deg", "this rig's residuals do not tell pose_turn; leave this limit out"),
         ("zzzzzzz=1", "nothing in this rig is called zzzzzzz; docs/ci.md lists the names"),

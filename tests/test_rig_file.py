@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from commands import Run
 from hypothesis import HealthCheck, given, settings
 from mutate import mutated, read_or_refused
 from rigs import LENSES, T_CAM0_IMU0, T_CAM1_CAM0, camera, full_rig
@@ -240,6 +241,14 @@ def _small(entry: Camera) -> Camera:
 
 
 SMALL = dump_rig(full_rig().model_copy(update={"cameras": {"cam0": _small(camera("pinhole-radtan"))}}))
+
+
+@pytest.mark.slow
+def test_a_recording_in_place_of_a_rig_is_told(run: Run, tmp_path: Path) -> None:
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+        said = run("validate", tmp_path / name, tmp_path / "rig.yaml", "--target", tmp_path / "board.yaml").mistake
+        assert said == f"{tmp_path / name}: is a recording and no rig file; where a command takes both, RIG.yaml comes first"
 
 
 @settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

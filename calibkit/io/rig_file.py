@@ -10,6 +10,7 @@ from calibkit.data.rig import VERSION, Imu, Rig, StageRun
 from calibkit.data.transforms import frames_of
 from calibkit.errors import BadInputError, one_line
 from calibkit.io.atomic import write_atomic
+from calibkit.io.ros2_folder import is_bag_file
 from calibkit.io.yaml_file import Document, dump_yaml, load_yaml
 
 _COMMENTS = {
@@ -26,6 +27,8 @@ V = TypeVar("V")
 
 def load_rig(path: Path) -> Rig:
     """Read a rig file; what is unknown, newer, contradictory or not finite is a BadInputError with its line."""
+    if is_bag_file(path):
+        raise BadInputError(f"{one_line(path)}: is a recording and no rig file; where a command takes both, RIG.yaml comes first")
     document = load_yaml(path)
     data = document.data
     if not isinstance(data, dict) or data.get("format") != "calibkit-rig":

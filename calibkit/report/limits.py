@@ -163,9 +163,15 @@ def _named(limit: Limit, known: dict[str, list[_Number]]) -> list[_Number]:
         raise BadInputError(f"{limit.source}: this rig has no {group}; leave this limit out")
     words = sorted(re.split(r"[._]", limit.name))
     near = [other for other in known if sorted(re.split(r"[._]", other)) == words or other.startswith(f"{limit.name}.")]
-    near = sorted(near, key=len) or difflib.get_close_matches(limit.name, known, 1)
+    alike = [other for other in known if _kind(other) == _kind(limit.name)]  # another transform before a lens's p2
+    near = sorted(near, key=len) or difflib.get_close_matches(limit.name, alike, 1, 0.4) or difflib.get_close_matches(limit.name, known, 1)
     hint = f"did you mean {one_line(near[0], 80)}?" if near else "docs/ci.md lists the names"
     raise BadInputError(f"{limit.source}: nothing in this rig is called {name}; {hint}")
+
+
+def _kind(name: str) -> str:
+    """Return T of T_cam0_imu0.p.sigma, cam of cam0.fx.sigma."""
+    return re.split(r"[._0-9]", name, maxsplit=1)[0]
 
 
 def _check(limit: Limit, found: _Number) -> Check:

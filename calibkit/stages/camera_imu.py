@@ -175,9 +175,10 @@ def name_imus(recording: Recording, base: Rig, asked: Sequence[str]) -> dict[str
         name, _, topic = each.rpartition("=")
         chosen = recording.choose("imu", topic or None)
         name = name or by_topic.get(chosen) or f"imu{len(out)}"
-        if name in out or chosen in out.values():
-            which = f"of the name {one_line(name)}" if name in out else f"of the topic {one_line(chosen)}"
-            raise BadInputError(f"two IMUs {which}: give each its own, --imu imu0=/a --imu imu1=/b")
+        if chosen in out.values():
+            raise BadInputError(f"--imu: the topic {one_line(chosen)} is given twice: drop one of them")
+        if name in out:
+            raise BadInputError(f"two IMUs of the name {one_line(name)}: give each its own, --imu imu0=/a --imu imu1=/b")
         out[name] = chosen
     return out
 

@@ -86,7 +86,10 @@ def test_version_stands_anywhere(run: Run, boom: Raise, arguments: list[str]) ->
 def test_bare_command_shows_help_and_is_a_usage_error(run: Run) -> None:
     code, out, err = run()
     assert (code, err) == (2, "")
-    assert out.startswith("Usage: calibkit ")
+    usage, _, commands = out.partition("\nCommands:\n")
+    assert usage.startswith("Usage: calibkit ")
+    assert len(commands.splitlines()) > len(cli.COMMANDS)
+    assert "..." not in commands  # no command's line is cut
 
 
 @pytest.mark.parametrize(

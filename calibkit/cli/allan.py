@@ -35,9 +35,10 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Noise of an IMU at rest: N, B, K of each axis by maximum likelihood with sigma, and Kalibr's four densities.
+    """Find the noise of an IMU that lay at rest.
 
-    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the recording is too short for one of N, B, K, and says how long it would take.
+    N, B, K of each axis by maximum likelihood with sigma, and Kalibr's four densities. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad
+    input; 3: the recording is too short for one of N, B, K, and says how long it would take.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

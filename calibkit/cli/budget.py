@@ -21,9 +21,10 @@ def run(
     json_file: options.Json = None,
     force: options.Force = False,
 ) -> None:
-    """Say what today's uncertainties cost: pixels, metres at range, phantom velocity, the largest first and what would lessen it.
+    """Say what today's uncertainties cost in pixels and metres.
 
-    Exit code 1 when something has no bound because it is not observable.
+    Pixels, metres at range, phantom velocity, the largest first and what would lessen it. Exit code 1 when something has no bound
+    because it is not observable.
     """
     from calibkit.cli.paths import refuse_clashes
     from calibkit.errors import one_line

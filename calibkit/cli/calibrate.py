@@ -36,11 +36,12 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Calibrate all that a recording allows: the lens (intrinsics) and, with an IMU, clocks (timeoffset) and the whole rig (joint).
+    """Calibrate all that a recording allows, in one go.
 
-    One rig file, updated by each stage, and one report at the end. Where --rig has a lens already, it is refined, not found anew; add the
-    IMU's noise (calibkit allan) by --rig, too. What earlier stages found is kept where a later one fails. Exit code 0: PASS or CHECK; 1:
-    FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
+    The lens (intrinsics) and, with an IMU, clocks (timeoffset) and the whole rig (joint). One rig file, updated by each stage, and one
+    report at the end. Where --rig has a lens already, it is refined, not found anew; add the IMU's noise (calibkit allan) by --rig,
+    too. What earlier stages found is kept where a later one fails. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is
+    not observable in this recording; 4: no solution.
     """
     from calibkit.cli.progress import bar
     from calibkit.data.verdict import Verdict

@@ -33,12 +33,12 @@ def run(
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
 ) -> None:
-    """Test a calibration against a new recording before a board: is it still right, and if not, what is wrong and by how much.
+    """Test a calibration on a new recording; say what is wrong.
 
-    The recording asks for a calibration of its own; the fewest causes that explain its difference to the rig file's, both uncertainties
-    paid for, are named with size and sigma: clock, mount, lens, board, IMU, and what drifts; without an IMU lenses, the places of cameras
-    beside each other, and the board. By chance alone one is named in 1 of 100 recordings. Exit code 0: it fits; 1: a cause is found; 2: bad
-    input.
+    Is it still right before a board, and if not, what is wrong and by how much? The recording asks for a calibration of its own; the
+    fewest causes that explain its difference to the rig file's, both uncertainties paid for, are named with size and sigma: clock,
+    mount, lens, board, IMU, and what drifts; without an IMU lenses, the places of cameras beside each other, and the board. By chance
+    alone one is named in 1 of 100 recordings. Exit code 0: it fits; 1: a cause is found; 2: bad input.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import tell

@@ -20,9 +20,10 @@ def run(
     json_file: options.Json = None,
     force: options.Force = False,
 ) -> None:
-    """Compare two calibrations: each change with its sigma, the pixel shift over image and range, and which change is real.
+    """Compare two calibrations: what changed beyond chance.
 
-    Exit code 1 when an entry changed by more than chance explains.
+    Each change with its sigma, the pixel shift over image and range, and which change is real. Exit code 1 when an entry changed by
+    more than chance explains.
     """
     from calibkit.cli.paths import refuse_clashes
     from calibkit.errors import one_line

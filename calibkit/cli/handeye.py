@@ -77,10 +77,11 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Hand-eye, A X = X B: camera and robot, or two sensors that move together; X with its covariance, every method, and what is wrong.
+    """Hand-eye, A X = X B: camera and robot, or two sensors.
 
-    Images with --target and --poses (a lens that no --rig file has is calibrated from them, too), or two streams of poses, or --pairs.
-    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the poses do not tell all of X; 4: no solution.
+    They move together; X with its covariance, every method, and what is wrong. Images with --target and --poses (a lens that no --rig
+    file has is calibrated from them, too), or two streams of poses, or --pairs. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3:
+    the poses do not tell all of X; 4: no solution.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

@@ -43,9 +43,10 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Scale, axes and biases of an IMU that was put down in many attitudes, in one joint estimate with sigmas.
+    """Find scale, axes and biases of an IMU from its attitudes.
 
-    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the attitudes do not tell everything, and what to add is said; 4: no solution.
+    It was put down in many, a few seconds each; all is one joint estimate with sigmas. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad
+    input; 3: the attitudes do not tell everything, and what to add is said; 4: no solution.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

@@ -27,7 +27,10 @@ def run(
     ros_distro: options.RosDistro = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite FILE.")] = False,
 ) -> None:
-    """Show topics, rates and duration of a recording, what is wrong with it, and what each topic could be used for."""
+    """Show topics, rates and flaws of a recording.
+
+    How long it is, what is wrong with it, and what each topic could be used for.
+    """
     from calibkit.cli.paths import refuse_clashes
     from calibkit.cli.progress import bar
     from calibkit.errors import one_line

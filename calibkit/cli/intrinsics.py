@@ -41,9 +41,10 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Calibrate cameras: lens, sigma of every number, verdict with reasons; several cameras with the transforms between them.
+    """Calibrate cameras from views of a board.
 
-    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
+    Lens, sigma of every number, verdict with reasons; several cameras with the transforms between them. Exit code 0: PASS or CHECK; 1:
+    FAIL; 2: bad input; 3: something is not observable in this recording; 4: no solution.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

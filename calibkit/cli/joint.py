@@ -48,11 +48,12 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Calibrate cameras and an IMU together: T_cam_imu, the offset of their clocks, the lens, gravity and biases, on one trajectory.
+    """Calibrate cameras and IMUs together, on one trajectory.
 
-    Starts from a rig file with the lenses (calibkit intrinsics) and, where there is one, the IMU's noise (calibkit allan); everything else
-    is found by itself. Move and turn the rig before the board for 30 s or more, about all axes. What the motion does not tell is named, and
-    not given as a number. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording.
+    T_cam_imu, the offset of their clocks, the lens, gravity and biases. Starts from a rig file with the lenses (calibkit intrinsics)
+    and, where there is one, the IMU's noise (calibkit allan); everything else is found by itself. Move and turn the rig before the
+    board for 30 s or more, about all axes. What the motion does not tell is named, and not given as a number. Exit code 0: PASS or
+    CHECK; 1: FAIL; 2: bad input; 3: something is not observable in this recording.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

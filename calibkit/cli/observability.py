@@ -30,7 +30,7 @@ def run(
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
 ) -> None:
-    """Say what a recording of cameras and an IMU before a board can determine.
+    """Say what a recording of cameras and an IMU can determine.
 
     The sigma that each number would have, what stays open, and which simple motion to add, the most useful first. For between two takes: no
     calibration is written. Exit code 0: all is observable; 2: bad input; 3: something is not.

@@ -56,11 +56,11 @@ def report(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an earlier report.")] = False,
     strict: options.Strict = False,
 ) -> None:
-    """Judge a rig file: verdict with reasons, every parameter with its sigma, the signals in its residuals, limits.
+    """Judge a rig file: verdict, sigmas, signals, limits.
 
-    A limit's NAME is a signal's key (as in report.json) or a parameter with .sigma or .value, of one part of the rig (cam0.fx.sigma) or of
-    all (fx.sigma); td stands for all time offsets, T.p and T.r for all translations and rotations. docs/ci.md has them all, and a
-    workflow.
+    The verdict with its reasons, every parameter with its sigma, the signals in its residuals. A limit's NAME is a signal's key (as in
+    report.json) or a parameter with .sigma or .value, of one part of the rig (cam0.fx.sigma) or of all (fx.sigma); td stands for all
+    time offsets, T.p and T.r for all translations and rotations. docs/ci.md has them all, and a workflow.
 
     Exit code 1 on FAIL, which includes broken limits and parameters that are not observable; 2 when a file is missing or was changed, or a
     limit names nothing in this rig.

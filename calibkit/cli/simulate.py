@@ -21,7 +21,10 @@ def run(
     show: Annotated[bool, typer.Option("--list", help="List scenarios and faults.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an earlier recording in DIR.")] = False,
 ) -> None:
-    """Write the recording of a simulated rig as a bag, with its target.yaml and its truth as a rig file."""
+    """Write a simulated rig's recording as a bag, with its truth.
+
+    Beside the bag, its target.yaml, and the truth as a rig file.
+    """
     from calibkit.cli.progress import bar
     from calibkit.errors import BadInputError, one_line
     from calibkit.simulation.faults import FAULTS

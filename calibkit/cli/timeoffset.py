@@ -77,12 +77,13 @@ def run(
     force: options.Force = False,
     strict: options.Strict = False,
 ) -> None:
-    """Find how far the clocks of two sensors on one rigid body are apart: t_to = t_of + td. Add td to the stamps of the first, --of.
+    """Find how far the clocks of two sensors are apart.
 
-    Pairs: camera and IMU (by a board with --target, else by features of the scene; the lens comes from --rig), poses or odometry and IMU,
-    two pose streams, two IMUs, wheel odometry and IMU. Two that are alone are found by themselves. Turn the rig back and forth about two
-    or more axes, once or twice a second: at rest, or at a constant rate of turn, nothing tells td. Drifts and jumps of a clock are told.
-    Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input; 3: the recording does not tell td.
+    Both are on one rigid body: t_to = t_of + td; add td to the stamps of the first, --of. Pairs: camera and IMU (by a board with
+    --target, else by features of the scene; the lens comes from --rig), poses or odometry and IMU, two pose streams, two IMUs, wheel
+    odometry and IMU. Two that are alone are found by themselves. Turn the rig back and forth about two or more axes, once or twice a
+    second: at rest, or at a constant rate of turn, nothing tells td. Drifts and jumps of a clock are told. Exit code 0: PASS or CHECK;
+    1: FAIL; 2: bad input; 3: the recording does not tell td.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import show

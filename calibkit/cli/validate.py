@@ -32,10 +32,11 @@ def run(
     ros_distro: options.RosDistro = None,
     force: options.Force = False,
 ) -> None:
-    """Ask a camera-IMU calibration for what it says of a recording before a board that it was not made from.
+    """Ask a camera-IMU calibration what it says of a recording.
 
-    Residuals by the rig file and at best, against the rate of turn, each half by itself, gravity and the board's size; and what calibkit
-    diagnose finds. Exit code 0: PASS or CHECK; 1: FAIL; 2: bad input.
+    The recording is before a board, and the calibration was not made from it. Residuals by the rig file and at best, against the rate
+    of turn, each half by itself, gravity and the board's size; and what calibkit diagnose finds. Exit code 0: PASS or CHECK; 1: FAIL;
+    2: bad input.
     """
     from calibkit.cli.progress import bar
     from calibkit.cli.shown import tell

@@ -9,9 +9,12 @@ from conftest import Run
 from recorded_files import write_session
 from time_offset_samples import camera_session
 
+from calibkit.data.rig import Rig
+from calibkit.data.transforms import make_transform
 from calibkit.estimation.speed_sweep import sweep
-from calibkit.io.rig_file import save_rig
+from calibkit.io.rig_file import load_rig, save_rig
 from calibkit.simulation.truth import true_rig
+from calibkit.stages.validate import Measured, _distance
 
 TARGET = Path(__file__).resolve().parent.parent / "sample_bags" / "target.yaml"
 TD = 0.005
@@ -37,14 +40,34 @@ def ask(folder: Path, rig: str, *more: object) -> tuple[object, ...]:
 
 def test_what_is_right_passes(run: Run, files: Path, tmp_path: Path) -> None:
     js = tmp_path / "found.json"
-    said = run(*ask(files, "rig.yaml", "--json", js))
+    said = run(*ask(files, "rig.yaml", "--json", js, "--distance", "cam0:imu0=69mm"))
     assert said.code == 0, said
+    assert "ok  distance, cam0 to imu0: 69.04 +- 0 mm by the rig file, 69.00 +- 1 mm as measured" in said.out
     assert "PASS: the calibration fits this recording" in said.out
     found = json.loads(js.read_text())
     assert all(check["good"] for check in found["checks"])
     assert {check["name"] for check in found["checks"]} >= {"repeatability", "gravity", "board"}
     assert found["speed"]["cam0's corners"]["at_rest"] == pytest.approx(0.2 * np.sqrt(2), rel=0.05)
     assert said.err.count("\n") == 1  # the corners' file without sigmas
+
+
+def test_distances_that_are_wrong_or_no_distances(run: Run, files: Path) -> None:
+    assert (
+        "--distance cam0 to cam7: no transform of the rig file joins the two"
+        in run(*ask(files, "rig.yaml", "--distance", "cam0:cam7=1m")).mistake
+    )
+    assert "write two sensors and their distance" in run(*ask(files, "rig.yaml", "--distance", "69mm")).mistake
+    assert "write a number with its unit" in run(*ask(files, "rig.yaml", "--distance", "cam0:imu0=69")).mistake
+
+
+def test_a_measured_distance_speaks_against_a_rig(files: Path) -> None:
+    """69.04 mm, known to 0.5 mm along itself, against 75 +- 1 mm and against 71 +- 1 mm."""
+    rig = load_rig(files / "rig.yaml")
+    T = rig.transforms["T_imu0_cam0"]
+    known = Rig(transforms={"T_imu0_cam0": make_transform("imu0", "cam0", T.matrix, np.diag([0.25e-6] * 3 + [1e-6] * 3))})
+    far, near = (_distance(known, Measured("imu0", "cam0", size, 0.001)) for size in (0.075, 0.071))
+    assert (far.good, near.good) == (False, True)
+    assert "69.04 +- 0.5 mm by the rig file" in far.text
 
 
 def test_what_is_wrong_fails_with_its_cause(run: Run, files: Path) -> None:

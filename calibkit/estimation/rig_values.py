@@ -83,6 +83,17 @@ def chained(rig: Rig, a: str, b: str) -> tuple[Array, Array] | None:
     return found[0], cov
 
 
+def distance(rig: Rig, a: str, b: str) -> tuple[float, float] | None:
+    """Return how far the origins of two frames are apart, m, with sigma: d = |p|, dd = p^T R rho / d; None where nothing joins them."""
+    found = chained(rig, a, b)
+    if found is None:
+        return None
+    T, cov = found
+    size = float(np.linalg.norm(T[:3, 3]))
+    along = T[:3, :3].T @ T[:3, 3] / max(size, 1e-12)
+    return size, float(np.sqrt(along @ cov[:3, :3] @ along))
+
+
 def inverse_transform(name: str, entry: Transform) -> Transform:
     """Return T_b_a of T_a_b: (T exp(d))^-1 = T^-1 exp(-Ad_T d).
 

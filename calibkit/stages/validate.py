@@ -11,6 +11,7 @@ from calibkit.data.rig import Rig
 from calibkit.errors import BadInputError, one_line
 from calibkit.estimation.joint_checks import Checks, Halves, check_joint
 from calibkit.estimation.joint_suspects import left_by_sensor
+from calibkit.estimation.rig_values import distance
 from calibkit.estimation.speed_sweep import Sweep, sweep
 from calibkit.geometry.spline import Steps, basis, turning
 from calibkit.report.columns import columns
@@ -99,18 +100,48 @@ class Validated:
         }
 
 
-def validate(sources: Sequence[Path], target: Path, rig: Rig, options: Options | None = None, progress: Progress = silent) -> Validated:
+@dataclass(frozen=True)
+class Measured:
+    """A distance between two sensors that somebody measured, m."""
+
+    a: str
+    b: str
+    size: float
+    sigma: float
+
+
+def validate(
+    sources: Sequence[Path],
+    target: Path,
+    rig: Rig,
+    options: Options | None = None,
+    progress: Progress = silent,
+    distances: Sequence[Measured] = (),
+) -> Validated:
     """Ask a rig file's calibration of cameras and IMU for what it says of a recording before a board that it was not made from.
 
     Errors as `stages.diagnose.examine` has them.
     """
+    measured = tuple(_distance(rig, each) for each in distances)
     if not has_imu(sources, options or Options()):
         names = ", ".join(one_line(source.name) for source in sources)
         raise BadInputError(f"{names}: no IMU in it: validate asks cameras and an IMU together; calibkit diagnose tests cameras alone")
     found = examine(sources, target, rig, options, progress)
     checks = check_joint(found.joint.fit)
     sweeps = _sweeps(found)
-    return Validated(_lines(found, checks, sweeps), sweeps, checks.halves, found)
+    return Validated(_lines(found, checks, sweeps) + measured, sweeps, checks.halves, found)
+
+
+def _distance(rig: Rig, told: Measured) -> Line:
+    """Compare a measured distance with the rig file's."""
+    name = f"{one_line(told.a)} to {one_line(told.b)}"
+    found = distance(rig, told.a, told.b)
+    if found is None:
+        raise BadInputError(f"--distance {name}: no transform of the rig file joins the two: name sensors that it has")
+    size, sigma = found
+    good = abs(size - told.size) < APART * float(np.hypot(sigma, told.sigma))
+    text = f"{1e3 * size:.2f} +- {1e3 * sigma:.2g} mm by the rig file, {1e3 * told.size:.2f} +- {1e3 * told.sigma:.2g} mm as measured"
+    return Line(f"distance, {name}", text, good)
 
 
 def _sweeps(found: Examined) -> dict[str, tuple[Sweep, str]]:

@@ -9,7 +9,7 @@ from time_offset_samples import camera_session, lens
 from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.result import Result
 from calibkit.estimation.added_motion import missing_motions
-from calibkit.estimation.joint import BesideInput, CameraInput, ImuNoise, Joint, Settings, calibrate_joint
+from calibkit.estimation.joint import CameraInput, ImuGiven, ImuNoise, Joint, Settings, calibrate_joint
 from calibkit.estimation.joint_checks import check_joint
 from calibkit.estimation.joint_imu import ImuInput, NamedImu
 from calibkit.estimation.joint_result import joint_result
@@ -41,7 +41,7 @@ class Recording:
         return CameraInput(self.views, lens(self.session))
 
     def fitted(self, settings: Settings | None = None, beside: Sequence[ImuSamples] = ()) -> Joint:
-        return calibrate_joint([self.camera], self.imu, self.noise, settings, beside=[BesideInput(each, self.noise) for each in beside])
+        return calibrate_joint([self.camera], self.imu, self.noise, settings, beside=[ImuGiven(each, self.noise) for each in beside])
 
     def result(self, joint: Joint, halves: bool = False, imu: ImuInput | None = None, beside: Sequence[ImuSamples] = ()) -> Result:
         """Return what the command would say of the fit."""

@@ -104,7 +104,7 @@ def test_two_imus_in_one_run(run: Run, session: Session, files: Path, tmp_path: 
     T = np.array(rig.transforms["T_imu1_imu0"].matrix)
     assert np.abs(T[:3, :3] - turn.T).max() < 5e-4
     assert np.abs(T[:3, 3]).max() < 1e-3
-    assert rig.time_offsets["dt_imu0_imu1"].offset.value == pytest.approx(-0.010, abs=1e-4)
+    assert rig.time_offsets["dt_imu0_imu1"].offset.value == pytest.approx(-0.010, abs=1e-5)
     assert set(rig.imus) == {"imu0", "imu1"}
     page = (report / "report.html").read_text()
     assert all(imu in page for imu in ("imu1_gyro", "imu1_accel"))

@@ -63,10 +63,12 @@ def run(
             from calibkit.stages.diagnose_report import write_cameras
 
             write_cameras(cameras, report, options.command())
-        tell(cameras.diagnosed, json_file, force, report)
-    found = examine(sources, target, known, asked, bar)
-    if report is not None:
-        from calibkit.stages.diagnose_report import write_diagnosis
+        diagnosed = cameras.diagnosed
+    else:
+        found = examine(sources, target, known, asked, bar)
+        if report is not None:
+            from calibkit.stages.diagnose_report import write_diagnosis
 
-        write_diagnosis(found, report, options.command())
-    tell(found.diagnosed, json_file, force, report)
+            write_diagnosis(found, report, options.command())
+        diagnosed = found.diagnosed
+    tell(diagnosed, json_file, force, report)

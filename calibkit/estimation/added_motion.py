@@ -36,8 +36,7 @@ class AddedMotion:
     """Ten seconds of one simple motion."""
 
     text: str
-    cov: Array  # (p, p) of the calibration with it, and with those before it
-    left: float  # the worst sigma of T and dt then, in units of what must be known
+    left: float  # the worst sigma of T and dt with it, and with those before it, in units of what must be known
 
 
 def missing_motions(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
@@ -69,7 +68,7 @@ def _missing(fit: JointFit, trust: Trust) -> tuple[AddedMotion, ...]:
         best = min(covs, key=lambda text: worst(covs[text], trust.scales, fit))
         known = known + told.pop(best)
         before, left = left, worst(covs[best], trust.scales, fit)
-        found.append(AddedMotion(best, covs[best], left))
+        found.append(AddedMotion(best, left))
         if left > _HELPS * before:
             return tuple(found[:-1])
     return tuple(found)

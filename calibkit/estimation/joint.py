@@ -73,8 +73,8 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class BesideInput:
-    """A further IMU's samples, and what is known of it."""
+class ImuGiven:
+    """An IMU's samples, and what is known of it."""
 
     samples: ImuSamples
     noise: ImuNoise
@@ -120,14 +120,14 @@ def calibrate_joint(
     noise: ImuNoise,
     settings: Settings | None = None,
     progress: Progress = silent,
-    beside: Sequence[BesideInput] = (),
+    beside: Sequence[ImuGiven] = (),
 ) -> Joint:
     """Return the joint maximum-likelihood estimate of T_cam_imu, dt, lenses, gravity and biases, and T_imu_ref and dt of IMUs beside.
 
     BadInputError where cameras and IMUs share no time or cannot be brought together.
     """
     settings = settings or Settings()
-    first = BesideInput(imu, noise, settings.imu, settings.imu_information, settings.extras)
+    first = ImuGiven(imu, noise, settings.imu, settings.imu_information, settings.extras)
     with threadpool_limits(1, user_api="blas"):  # the matrices are small: threads of BLAS cost ten times what they bring
         return _calibrate(cameras, [_Measured.of(each) for each in (first, *beside)], settings, progress)
 
@@ -138,11 +138,11 @@ class _Measured:
 
     samples: ImuSamples
     corrected: ImuSamples  # its scale and axes as known so far corrected: near enough for the start
-    of_input: BesideInput
+    of_input: ImuGiven
     frozen: tuple[Frozen, ...]
 
     @classmethod
-    def of(cls, each: BesideInput) -> "_Measured":
+    def of(cls, each: ImuGiven) -> "_Measured":
         samples, frozen = without_frozen(each.samples.select(in_order(each.samples.t_ns)))
         accel, gyro = each.model.correct(samples.accel, samples.gyro)
         return cls(samples, replace(samples, accel=accel, gyro=gyro), each, frozen)

@@ -11,7 +11,7 @@ from calibkit.data.observations import BoardViews, ImuSamples
 from calibkit.data.progress import Progress
 from calibkit.data.rig import Camera, Imu, Rig
 from calibkit.errors import BadInputError, one_line
-from calibkit.estimation.joint import BesideInput, CameraInput, ImuNoise, Joint, Settings, calibrate_joint
+from calibkit.estimation.joint import CameraInput, ImuGiven, ImuNoise, Joint, Settings, calibrate_joint
 from calibkit.estimation.joint_imu import ImuInput, imu_input
 from calibkit.estimation.joint_problem import GravityPrior
 from calibkit.estimation.stamps import StampReport, check_stamps
@@ -94,7 +94,7 @@ class CameraImu(CamerasRead):
         """Return the joint estimate; BadInputError names the recording and the sensors."""
         try:
             beside = [
-                BesideInput(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras)
+                ImuGiven(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras)
                 for each in self.imus[1:]
             ]
             return calibrate_joint(cameras, self.imu.input.samples, _noise(self.imu.known), settings, progress, beside)

@@ -42,7 +42,7 @@ class Options(Sensors):
 
 @dataclass(frozen=True)
 class Noise:
-    """A sensor that scatters more than the calibration has it."""
+    """A sensor that scatters otherwise than the calibration has it."""
 
     text: str
     factor: float
@@ -91,8 +91,9 @@ class Diagnosed:
                 "",
                 f"  {100 * self.left:.0f} % of the excess is no single cause's: these sizes are rough; run calibkit {self.again} again",
             ]
-        out += ["", *(f"  {noise.text}" for noise in self.noise)] if self.noise else []
-        out += ["", f"  not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
+        usual = [f"  {noise.text}" for noise in self.noise if not noise.no_fit]
+        out += ["", *usual] if usual else []
+        out += ["", *(f"  {line}" for line in self.not_tested)] if self.not_tested else []
         return "\n".join([*out, "", self.verdict])
 
     @property
@@ -101,13 +102,26 @@ class Diagnosed:
         return bool(self.diagnosis.unexplained_log_p < np.log(FAMILY_WISE))
 
     @property
-    def verdict(self) -> str:
-        """Return the answer in one line."""
+    def not_tested(self) -> list[str]:
+        """Return what was not tested, a sentence for each reason."""
+        out = [f"not tested, the motion does not tell them: {', '.join(self.untested)}"] if self.untested else []
+        return out + ([f"not tested without an IMU: {', '.join(self.beside)}"] if self.beside else [])
+
+    @property
+    def misfit(self) -> str:
+        """Return what is wrong as a whole, which single causes do not tell; "" where they do."""
         if no_fit := [noise.text for noise in self.noise if noise.no_fit]:
-            return f"FAIL: {no_fit[0]}"
+            return no_fit[0]
         if self.told and self.left > _MOSTLY_LEFT:
             misses = f"the calibration misses this recording, and {100 * self.left:.0f} % of it is no single cause's"
-            return f"FAIL: {misses}: run calibkit {self.again} again; what follows may be blamed wrongly: {self.told[0].text}"
+            return f"{misses}: run calibkit {self.again} again; its causes may be blamed wrongly"
+        return ""
+
+    @property
+    def verdict(self) -> str:
+        """Return the answer in one line."""
+        if self.misfit:
+            return f"FAIL: {self.misfit}"
         if self.told:
             worst = max(self.rms, key=lambda rms: rms.held / rms.best)
             hide = f": noise of {worst.held:.2g} {worst.unit} for {worst.sensor} would hide it" if worst.held > _HIDES * worst.best else ""
@@ -115,15 +129,7 @@ class Diagnosed:
         if self.unexplained:
             misses = "the calibration misses this recording by more than its sigmas, for no single cause"
             return f"CHECK: {misses}: run calibkit {self.again} again"
-        return (
-            "PASS: the calibration fits this recording within its own uncertainty"
-            + (", but for its noise" if self.noise else "")
-            + self._not_asked
-        )
-
-    @property
-    def _not_asked(self) -> str:
-        return f"; {', '.join(self.beside)}: not tested without an IMU" if self.beside else ""
+        return "PASS: the calibration fits this recording within its own uncertainty" + (", but for its noise" if self.noise else "")
 
     def as_json(self) -> dict[str, object]:
         """Return everything, for machines."""
@@ -153,8 +159,8 @@ class Diagnosed:
 
     @property
     def exit_code(self) -> int:
-        """SPEC section 6: 1 where a cause is found."""
-        return 1 if self.diagnosis.causes or any(noise.no_fit for noise in self.noise) else 0
+        """SPEC section 6: 1 where a cause is found, or nothing fits."""
+        return 1 if self.told or self.misfit else 0
 
 
 @dataclass(frozen=True)

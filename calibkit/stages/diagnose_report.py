@@ -44,14 +44,14 @@ def write_diagnosis(found: Examined, folder: Path, command: str) -> None:
 
 def reasons_of(diagnosed: Diagnosed) -> list[Reason]:
     """Return what was found as sentences of a verdict."""
-    reasons = []
+    reasons = [Reason(Verdict.FAIL, diagnosed.misfit)] if diagnosed.misfit else []
     for cause, told in zip(diagnosed.diagnosis.causes, diagnosed.told, strict=True):
         alike = f"; this motion does not tell it from {', '.join(told.alike)}" if told.alike else ""
         reasons.append(Reason(Verdict.FAIL, f"{told.text} ({100 * cause.share:.0f} % of the excess): {told.mend}{alike}"))
     if not reasons:
         verdict, _, text = diagnosed.verdict.partition(": ")
         reasons.append(Reason(Verdict(verdict), text))
-    return [*reasons, *(Reason(Verdict.PASS, noise.text) for noise in diagnosed.noise)]
+    return [*reasons, *(Reason(Verdict.PASS, noise.text) for noise in diagnosed.noise if not noise.no_fit)]
 
 
 def write_cameras(found: CamerasExamined, folder: Path, command: str) -> None:
@@ -93,8 +93,7 @@ class _Page:
         rig = self.rig.model_copy(update={"provenance": [run]})
         rms = [["residuals, rms", "by the rig file", "at best", "unit"]]
         rms += [[each.sensor, f"{each.held:.3g}", f"{each.best:.3g}", each.unit] for each in diagnosed.rms]
-        lines = [f"under test, on {diagnosed.what}"]
-        lines += [f"not tested, the motion does not tell them: {', '.join(diagnosed.untested)}"] if diagnosed.untested else []
+        lines = [f"under test, on {diagnosed.what}", *diagnosed.not_tested]
         result = Result(self.stage, rig, tuple(reasons), self.sets, {**self.facts, "lines": lines, "tables": [rms, *tables], "found": told})
         seen = tuple(views(result))
         signals = tuple(signal for view in seen for signal in measure(view))

@@ -53,7 +53,7 @@ class Validated:
     @property
     def verdict(self) -> str:
         """Return the answer in one line."""
-        if self.diagnosed.told:
+        if self.diagnosed.exit_code:
             return self.diagnosed.verdict
         bad = [line for line in self.lines if not line.good]
         return f"FAIL: {bad[0].name}: {bad[0].text}" if bad else self.diagnosed.verdict

@@ -172,7 +172,7 @@ class _Descent:
 def _descend(image: Smoothed, uv: Array, points: Array, light: Array | None, iterations: int) -> _Descent:
     """Move corners uv (n, 2) by Gauss-Newton; points (2, n, 2 pairs) px are the windows, `light` is found where it is None."""
     u, v = uv.T[:, :, None] + points
-    right, left, below, above = _at(image, u + 0.5, v), _at(image, u - 0.5, v), _at(image, u, v + 0.5), _at(image, u, v - 0.5)
+    right, left, below, above = (_near(image, u + x, v + y) for x, y in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
     if light is None:
         slope = _light_slope(uv, (right + left + below + above).sum(1) / len(_HALF))
         light = 1 - points[0] * slope[:, :1] - points[1] * slope[:, 1:]
@@ -182,8 +182,8 @@ def _descend(image: Smoothed, uv: Array, points: Array, light: Array | None, ite
     xx, yy = xx + stiff, yy + stiff
     gain = np.stack([yy * x - xy * y, xx * y - xy * x], axis=1) / (xx * yy - xy**2)[:, None]
     uv = uv.copy()
-    for _ in range(iterations):
-        values = _at(image, uv[:, :1] + points[0], uv[:, 1:] + points[1]) * light
+    for left_over in reversed(range(iterations)):
+        values = (_near if left_over else _at)(image, uv[:, :1] + points[0], uv[:, 1:] + points[1]) * light
         odd_part = _difference(values) * _WEIGHT
         step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
         uv -= step
@@ -217,7 +217,8 @@ def _drawn_by_blur(maps: LocalMaps) -> Array:
     along, bend = np.swapaxes(maps.J, 1, 2), maps.Q[:, [0, 2]]  # (n, edge, 2)
     normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     shift = _BLUR_PX2 / 2 * np.sum(bend * normal, axis=-1, keepdims=True) / np.sum(along**2, axis=-1, keepdims=True)
-    out: Array = np.linalg.solve(normal, shift)[..., 0]
+    (a, b), (c, d), (p, q) = normal[:, 0].T, normal[:, 1].T, shift[..., 0].T
+    out: Array = np.stack([d * p - b * q, a * q - c * p], axis=-1) / (a * d - b * c)[:, None]
     return out
 
 

@@ -7,12 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from calibkit.estimation import joint_places
 from calibkit.estimation.camera_problem import CameraViews
 from calibkit.estimation.joint_inertial import ImuBeside, ImuRows
 from calibkit.estimation.joint_noise import draw
 from calibkit.estimation.joint_parts import projected
+from calibkit.estimation.joint_places import Places
 from calibkit.estimation.joint_problem import Frames, GravityPrior, JointProblem
-from calibkit.estimation.joint_state import EXTRAS, IMU_MODEL, CameraState, ImuState, JointState
+from calibkit.estimation.joint_state import EXTRAS, IMU_MODEL, M_A, M_G, PHI, CameraState, ImuState, JointState
 from calibkit.geometry import se3, so3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
@@ -120,6 +122,28 @@ def test_the_jacobians_are_those_of_differences(order: int, extras: tuple[str, .
     for index, slope in slopes(order, extras).items():
         gradient = (core if index >= 0 else border)[index]
         assert -2 * gradient == pytest.approx(slope[kind], rel=close, abs=close * scale), index
+
+
+def test_jacobians_between_samples_make_the_same_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, x = small(6, (M_G, M_A, PHI))
+    rng, n = np.random.default_rng(2), 400
+    rows = replace(
+        problem.imu,
+        t=np.sort(rng.uniform(0.05, 0.75, n)),
+        gyro=rng.standard_normal((n, 3)),
+        accel=9 * rng.standard_normal((n, 3)),
+        keep=rng.random((n, 2)) > 0.1,
+    )
+    problem, x = replace(problem, imu=rows, loss_scale=4.0), replace(x, imu=replace(x.imu, A_g=np.zeros((3, 3))))
+    assert Places.of(problem.knots, *problem.knots.locate(rows.t), True).at is not None
+    (cost, system), H = problem.linearize(x), dense(problem, x)
+    monkeypatch.setattr(joint_places, "_WORTH", np.inf)
+    (exact_cost, exact), exact_H = problem.linearize(x), dense(problem, x)
+    root = np.sqrt(np.diag(exact_H))
+    off = np.concatenate([(system.gradient_core - exact.gradient_core).ravel(), system.gradient_border - exact.gradient_border])
+    assert cost == pytest.approx(exact_cost, rel=1e-12)
+    assert np.abs((H - exact_H) / root[:, None] / root).max() < 2e-5
+    assert np.abs(off / root).max() < 1e-5 * np.sqrt(cost)  # |J^T r| <= |J| |r|
 
 
 def test_the_priors_gradient() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.joint_parts import Index, Part
+from calibkit.estimation.joint_places import Places
 from calibkit.estimation.joint_state import A_G, EXTRAS, M_A, M_G, PHI, SCALE, Border, ImuState, JointState, biases, of_imu
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -67,7 +68,7 @@ def feel(x: JointState, knots: Knots, steps: Steps, imu: ImuState | None, t: Arr
     n = len(i)
     by_knot, by = np.empty((n, 3, knots.order, 6)), {}
     if jacobians:
-        by_knot[..., :3] = np.einsum("nab,nbkc->nakc", so3.hat(force), at.dR)
+        by_knot[..., :3] = (so3.hat(force) @ at.dR.reshape(n, 3, -1)).reshape(at.dR.shape)
         by_knot[..., 3:] = x.board_scale * second[:, None, :, None] * RT[:, :, None, :]
         none = np.zeros((n, 3, 1))
         by = {"gravity": (np.zeros((n, 3, 3)), -RT), SCALE: (none, RT @ acceleration[..., None])}
@@ -128,13 +129,56 @@ def _measured_force(model: ImuModel, accel: Array) -> Array:
 def inertial_parts(
     x: JointState, knots: Knots, steps: Steps, border: Border, rows: ImuRows, j: int, some: slice, loss_scale: float
 ) -> tuple[Part, Part]:
-    """Return what some samples of IMU j's gyroscope and accelerometer say."""
-    k, imu, own = knots.order, x.imus[j], biases(j)
-    model, accel = imu.model, rows.accel[some]
-    i, felt = feel(x, knots, steps, imu if j else None, rows.t[some])
-    n, bias, omega = len(i), imu.bias[i], felt.omega
-    turns, sensitive, force = model.M_g @ model.C_g_i, model.A_g @ model.C_g_i, _measured_force(model, accel)
+    """Return what some samples of IMU j's gyroscope and accelerometer say.
 
+    Jacobians are smooth along a segment: of many samples they are taken at a few places and interpolated between (`Places`).
+    """
+    imu, own, t, accel = x.imus[j], biases(j), rows.t[some], rows.accel[some]
+    model, clock, of = imu.model, imu.dt if j else 0.0, imu if j else None
+    i, u = knots.locate(t + clock)
+    places = Places.of(knots, i, u, many=not _by_sample(model, border.free_of(j)))
+    _, felt = feel(x, knots, steps, of, t, jacobians=places.at is None)
+    if places.at is None:
+        columns = _columns(border, j, model, felt, _measured_force(model, accel))
+    else:
+        _, there = feel(x, knots, steps, of, places.at - clock)
+        columns = _columns(border, j, model, there, np.zeros((len(places.at), 3)))
+    bias, turns, sensitive = imu.bias[i], model.M_g @ model.C_g_i, model.A_g @ model.C_g_i
+    left_gyro = rows.gyro[some] - felt.omega @ turns.T - _measured_force(model, accel) @ sensitive.T - bias[:, :3]
+    left_accel = accel - felt.force @ model.M_a.T - bias[:, 3:]
+
+    def part(kind: str, K: Array, left: Array, sigma: Array, keep: NDArray[np.bool_], offsets: Index) -> Part:
+        left = left / sigma
+        loss, down = cauchy(np.sum(left**2, axis=1), loss_scale)
+        N = places.products(K / sigma[:, None], left, down * keep)
+        t_s, cost, count = knots.middle(places.segment), float(np.sum(loss[keep])), 3 * int(keep.sum())
+        return Part(of_imu(kind, j), t_s, border.knot * places.segment, offsets, columns.touch, N, cost, count)
+
+    knot = border.knot * np.arange(knots.order)[:, None]
+    rotation, motion = knot + np.arange(3), knot + np.arange(6)
+    offsets = np.concatenate([rotation[0], np.arange(own.start, own.start + 3), rotation[1:].ravel()])
+    gyro = part("gyro", columns.gyro, left_gyro, rows.sigma[:3], rows.keep[some, 0], offsets)
+    offsets = np.concatenate([motion[0], np.arange(own.start + 3, own.stop), motion[1:].ravel()])
+    return gyro, part("accel", columns.accel, left_accel, rows.sigma[3:], rows.keep[some, 1], offsets)
+
+
+def _by_sample(model: ImuModel, free: tuple[str, ...]) -> bool:
+    """Whether Jacobians go with the samples' own noise: those of a gyroscope that feels accelerations, as measured."""
+    return A_G in free or (bool(np.any(model.A_g)) and (PHI in free or M_A in free))
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """How readings go with the unknowns: [first knot | bias | other knots | border]."""
+
+    gyro: Array  # (n, 3, q)
+    accel: Array
+    touch: Index  # of the border
+
+
+def _columns(border: Border, j: int, model: ImuModel, felt: Felt, force: Array) -> _Columns:
+    """Return the Jacobians of IMU j's readings from those of what it feels, and the force (n, 3) that was measured."""
+    n, turns, sensitive = len(force), model.M_g @ model.C_g_i, model.A_g @ model.C_g_i
     by = {name: columns for name, columns in felt.by.items() if name != SCALE or SCALE in border.extras}
     of_gyro = {name: turns @ a for name, (a, _) in by.items()}
     of_accel = {name: model.M_a @ b for name, (_, b) in by.items()}
@@ -142,9 +186,9 @@ def inertial_parts(
     for columns in (of_gyro, of_accel):
         columns |= {name: np.zeros((n, 3, EXTRAS[name])) for name in free}
     if M_G in free:
-        of_gyro[M_G] = by_lower(omega @ model.C_g_i.T)
+        of_gyro[M_G] = by_lower(felt.omega @ model.C_g_i.T)
     if PHI in free:
-        of_gyro[PHI] = -turns @ so3.hat(omega) - sensitive @ so3.hat(force)
+        of_gyro[PHI] = -turns @ so3.hat(felt.omega) - sensitive @ so3.hat(force)
     if M_A in free:
         of_gyro[M_A] = -sensitive @ np.linalg.inv(model.M_a) @ by_lower(force)
         of_accel[M_A] = by_lower(felt.force)
@@ -152,34 +196,12 @@ def inertial_parts(
         of_gyro[A_G] = np.einsum("rs,nc->nrsc", np.eye(3), force @ model.C_g_i.T).reshape(n, 3, 9)
     shared = ("gravity", SCALE)
     touch = border.at(name if name in shared else of_imu(name, j) if name in free else f"{name} {j}" for name in of_gyro)
-
-    def samples(kind: str, K: Array, sigma: Array, keep: NDArray[np.bool_], offsets: Index) -> Part:
-        """Return the products of rows K (n, 3, q), weighed, by the segments that they fall into."""
-        K /= sigma[:, None]
-        loss, down = cauchy(np.sum(K[..., -1] ** 2, axis=1), loss_scale)
-        K *= (np.sqrt(down) * keep)[:, None, None]
-        segment, N = _by_segment(K, i)
-        cost = float(np.sum(loss[keep]))
-        return Part(of_imu(kind, j), knots.middle(segment), border.knot * segment, offsets, touch, N, cost, 3 * int(keep.sum()))
-
-    knot = border.knot * np.arange(k)[:, None]
+    eyes = np.broadcast_to(np.eye(3), (n, 3, 3))
     by_knot = turns @ felt.omega_by_knot.reshape(n, 3, -1)
-    left = rows.gyro[some] - omega @ turns.T - force @ sensitive.T - bias[:, :3]
-    K = np.concatenate([by_knot[..., :3], _eyes(n), by_knot[..., 3:], *of_gyro.values(), left[..., None]], axis=2)
-    rotation = knot + np.arange(3)
-    offsets = np.concatenate([rotation[0], np.arange(own.start, own.start + 3), rotation[1:].ravel()])
-    gyro = samples("gyro", K, rows.sigma[:3], rows.keep[some, 0], offsets)
-
+    gyro = np.concatenate([by_knot[..., :3], eyes, by_knot[..., 3:], *of_gyro.values()], axis=2)
     by_knot = model.M_a @ felt.force_by_knot.reshape(n, 3, -1)
-    left = accel - felt.force @ model.M_a.T - bias[:, 3:]
-    K = np.concatenate([by_knot[..., :6], _eyes(n), by_knot[..., 6:], *of_accel.values(), left[..., None]], axis=2)
-    motion = knot + np.arange(6)
-    offsets = np.concatenate([motion[0], np.arange(own.start + 3, own.stop), motion[1:].ravel()])
-    return gyro, samples("accel", K, rows.sigma[3:], rows.keep[some, 1], offsets)
-
-
-def _eyes(n: int) -> Array:
-    return np.broadcast_to(np.eye(3), (n, 3, 3))
+    accel = np.concatenate([by_knot[..., :6], eyes, by_knot[..., 6:], *of_accel.values()], axis=2)
+    return _Columns(gyro, accel, touch)
 
 
 def by_lower(v: Array) -> Array:
@@ -188,15 +210,3 @@ def by_lower(v: Array) -> Array:
     rows, columns = np.tril_indices(3)
     out[:, rows, np.arange(6)] = v[:, columns]
     return out
-
-
-def _by_segment(K: Array, i: Index) -> tuple[Index, Array]:
-    """Return the segments that rows K (n, 6, q) fall into, sorted, and K^T K of each."""
-    segment, row = np.unique(i, return_inverse=True)
-    count = np.bincount(row)
-    start = np.cumsum(count) - count
-    slot = np.arange(len(i)) - start[row]  # times are sorted
-    padded = np.zeros((len(segment), int(count.max()), *K.shape[1:]))
-    padded[row, slot] = K
-    padded = padded.reshape(len(segment), -1, K.shape[-1])
-    return segment, np.swapaxes(padded, 1, 2) @ padded

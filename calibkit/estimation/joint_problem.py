@@ -211,11 +211,13 @@ class JointProblem:
         offsets = (border.knot * np.arange(k)[:, None] + np.arange(6)).ravel()
         where = border.camera(c)
         for rows, G, cost in map_views(frames.views, products):
-            f, moving, others = len(G), motion.shape[-1], G.shape[-1] - 6
-            chain = np.zeros((f, 6 + others, moving + others))
-            chain[:, :6, :moving] = motion[rows]
-            chain[:, np.arange(6, 6 + others), np.arange(moving, moving + others)] = 1
-            N = np.swapaxes(chain, 1, 2) @ G @ chain
+            M, moving = motion[rows], motion.shape[-1]
+            by_motion = G[:, :, :6] @ M
+            N = np.empty((len(G), *np.add(G.shape[1:], moving - 6)))
+            N[:, :moving, :moving] = np.swapaxes(M, 1, 2) @ by_motion[:, :6]
+            N[:, moving:, :moving] = by_motion[:, 6:]
+            N[:, :moving, moving:] = np.swapaxes(by_motion[:, 6:], 1, 2)
+            N[:, moving:, moving:] = G[:, 6:, 6:]
             corners = int(np.count_nonzero(frames.views.weight[rows]))
             t, touch = (frames.t + camera.dt)[rows], np.arange(where.start, where.stop)
             yield self._drifting(Part(f"camera {c}", t, border.knot * i[rows], offsets, touch, N, cost, 2 * corners), c)

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibkit.estimation.joint_fit import JointFit
-from calibkit.estimation.joint_noise import DRAWS, draw, schur
-from calibkit.estimation.joint_problem import JointProblem
+from calibkit.estimation.joint_fit import JointFit, around
+from calibkit.estimation.joint_problem import DAMPING, JointProblem
 from calibkit.estimation.joint_rivals import border_step
 from calibkit.estimation.joint_state import LINE, LINE_SCALE, SCALE, JointState
 from calibkit.estimation.joint_suspects import rms_by_sensor
@@ -50,9 +49,9 @@ def suspects(fit: JointFit) -> tuple[tuple[float, float], tuple[tuple[float, flo
     cameras = range(len(fit.problem.cameras))
     shut = LINE not in fit.problem.extras and not any(camera.line_delay for camera in fit.x.cameras)
     asked = replace(fit, problem=replace(fit.problem, extras=(*fit.problem.extras, SCALE, *((LINE,) if shut else ()))))
-    _, system = asked.problem.linearize(fit.x)
-    asked = replace(asked, system=system, drawn=draw(system, DRAWS))
-    answer, S = schur(system)
+    system, drawn, epochs = around(asked.problem, fit.x)
+    asked = replace(asked, system=system, drawn=drawn, epochs=epochs)
+    answer, S = drawn.core_answer, drawn.S
     g = system.gradient_border - answer.T @ system.gradient_core.ravel()
     scales = border_scales(asked)
     step = np.linalg.lstsq(S * scales[:, None] * scales, scales * g, rcond=1e-14)[0] * scales
@@ -80,7 +79,7 @@ def _halves(fit: JointFit) -> Halves | None:
     z[fit.problem.border["gravity"]] = 0
     first, second = halves
     held = replace(second.problem, held=True)
-    other = minimise(held, _with_calibration(second.x, first.x), max_steps=_HALF_STEPS, tolerance=1e-5).x
+    other = minimise(held, _with_calibration(second.x, first.x), max_steps=_HALF_STEPS, tolerance=1e-5, damping=DAMPING).x
     count = range(len(fit.problem.cameras))
     rms, own = (tuple(rms_by_sensor(second.problem, x)[f"camera {c}"] for c in count) for x in (other, second.x))
     return Halves(z, rms, own)
@@ -92,10 +91,10 @@ def _with_calibration(x: JointState, of: JointState) -> JointState:
 
 
 def _refit(problem: JointProblem, x: JointState) -> JointFit:
-    solution = minimise(problem, x, max_steps=_HALF_STEPS * 3, tolerance=1e-6)
-    _, system = problem.linearize(solution.x)
+    solution = minimise(problem, x, max_steps=_HALF_STEPS * 3, tolerance=1e-6, damping=DAMPING)
+    system, drawn, epochs = around(problem, solution.x)
     found = tuple(frames.views.weight > 0 for frames in problem.cameras)
-    return JointFit(problem, solution.x, system, draw(system, DRAWS), found, {}, {}, solution.converged, solution.steps)
+    return JointFit(problem, solution.x, system, drawn, epochs, found, {}, {}, solution.converged, solution.steps)
 
 
 def part_of(problem: JointProblem, x: JointState, segments: slice) -> tuple[JointProblem, JointState]:

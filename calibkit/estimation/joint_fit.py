@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.joint_noise import DRAWS, Component, Drawn, components, draw
-from calibkit.estimation.joint_problem import JointProblem
+from calibkit.estimation.joint_parts import Epochs
+from calibkit.estimation.joint_problem import DAMPING, JointProblem
 from calibkit.estimation.joint_state import JointState, of_imu
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
@@ -33,6 +34,7 @@ class JointFit:
     x: JointState
     system: Arrowhead
     drawn: Drawn
+    epochs: Epochs
     found: tuple[NDArray[np.bool_], ...]  # (f, n) per camera: corners found
     factors: dict[str, float]  # real sigma over the stated one, by kind
     components: dict[str, Component]  # by the weights as found
@@ -56,14 +58,14 @@ def fit_roughly(problem: JointProblem, x: JointState) -> RoughFit:
     found = tuple(frames.views.weight for frames in problem.cameras)
     factors: dict[str, float] = {}
     # Wide open first: the seed's IMU sits in the camera.
-    solution = minimise(replace(problem, loss_scale=_LOSS * 20), x, max_steps=4, tolerance=1e-3)
+    solution = minimise(replace(problem, loss_scale=_LOSS * 20), x, max_steps=4, tolerance=1e-3, damping=DAMPING)
     steps = solution.steps
     for _ in range(_ROBUST_ROUNDS):
         scales = _robust_scales(problem, solution.x, found)
         if _settled(scales) and factors:
             break
         problem = _rescaled(problem, scales, factors)
-        solution = minimise(replace(problem, loss_scale=_LOSS), solution.x, max_steps=6, tolerance=1e-4)
+        solution = minimise(replace(problem, loss_scale=_LOSS), solution.x, max_steps=6, tolerance=1e-4, damping=DAMPING)
         steps += solution.steps
     return RoughFit(problem, solution.x, found, factors, steps)
 
@@ -73,7 +75,7 @@ def refine(rough: RoughFit) -> JointFit:
     found, factors, steps, x = rough.found, dict(rough.factors), rough.steps, rough.x
     problem = _without_outliers(rough.problem, x, found, factors)
     for rest in reversed(range(_ROUNDS)):
-        solution = minimise(problem, x, max_steps=20, tolerance=_TIGHT)
+        solution = minimise(problem, x, max_steps=20, tolerance=_TIGHT, damping=DAMPING)
         x, steps = solution.x, steps + solution.steps
         parts = list(problem.parts(x))
         _, system = problem.assembled(parts, x)
@@ -83,7 +85,16 @@ def refine(rough: RoughFit) -> JointFit:
         if not rest or _settled(scales):
             break
         problem = _rescaled(problem, scales, factors)
-    return JointFit(problem, x, system, drawn, tuple(weight > 0 for weight in found), factors, spent, solution.converged, steps)
+    kept = tuple(weight > 0 for weight in found)
+    return JointFit(problem, x, system, drawn, Epochs.of(parts, drawn.core_answer), kept, factors, spent, solution.converged, steps)
+
+
+def around(problem: JointProblem, x: JointState) -> tuple[Arrowhead, Drawn, Epochs]:
+    """Return the normal equations at x, states drawn from them, and what each epoch says of the border."""
+    parts = list(problem.parts(x))
+    _, system = problem.assembled(parts, x)
+    drawn = draw(system, DRAWS)
+    return system, drawn, Epochs.of(parts, drawn.core_answer)
 
 
 def _settled(scales: dict[str, float]) -> bool:

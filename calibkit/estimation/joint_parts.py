@@ -65,3 +65,19 @@ def projected(part: Part, core_answer: Array) -> tuple[Array, Array]:
     P[:, q:] = np.eye(p)[part.touch]
     PT = np.swapaxes(P, 1, 2)
     return PT @ part.N[:, :-1, :-1] @ P, (PT @ part.N[:, :-1, -1:])[..., 0]
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """What each epoch of the measurements says of the border, the core eliminated."""
+
+    t_s: Array  # (n,)
+    information: Array  # (n, p, p)
+    score: Array  # (n, p)
+
+    @classmethod
+    def of(cls, parts: Iterable[Part], core_answer: Array) -> "Epochs":
+        """Return the epochs of the parts but those that no measurement made."""
+        measured = [part for part in parts if part.kind != "stays"]
+        information, score = zip(*(projected(part, core_answer) for part in measured), strict=True)
+        return cls(np.concatenate([part.t_s for part in measured]), np.concatenate(information), np.concatenate(score))

@@ -7,9 +7,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibkit.estimation.diagnosis import Evidence, Suspect
-from calibkit.estimation.joint_fit import JointFit, corner_residuals
-from calibkit.estimation.joint_noise import DRAWS, draw, schur
-from calibkit.estimation.joint_problem import Drift, JointProblem
+from calibkit.estimation.joint_fit import JointFit, around, corner_residuals
+from calibkit.estimation.joint_problem import DAMPING, Drift, JointProblem
 from calibkit.estimation.joint_state import DRIFTING, LINE, M_A, M_G, PHI, SCALE, CameraState, JointState, model_step, of_imu
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.geometry import se3, so3
@@ -37,11 +36,11 @@ def evidence(fit: JointFit, known: Known, drifts: Sequence[Drift]) -> tuple[Evid
     extras = tuple(dict.fromkeys((*fit.problem.extras, *ASKED)))
     problem = replace(fit.problem, extras=extras, drifts=tuple(drifts))
     with threadpool_limits(1, user_api="blas"):
-        _, system = problem.linearize(fit.x)
-        asked = replace(fit, problem=problem, system=system, drawn=draw(system, DRAWS))
+        system, drawn, epochs = around(problem, fit.x)
+        asked = replace(fit, problem=problem, system=system, drawn=drawn, epochs=epochs)
         trust = joint_trust(asked)
     border, scales = problem.border, trust.scales
-    answer, S = schur(system)
+    answer, S = drawn.core_answer, drawn.S
     g = system.gradient_border - answer.T @ system.gradient_core.ravel()
     step = np.linalg.lstsq(S * scales[:, None] * scales, scales * g, rcond=1e-14)[0] * scales
     delta, cov = step + _from_known(asked, known), trust.cov + _of_known(asked, known)
@@ -108,7 +107,7 @@ def _suspects(fit: JointFit) -> list[Suspect]:
 
 def with_trajectory(problem: JointProblem, x: JointState) -> JointState:
     """Return the state with the trajectory that suits its calibration best."""
-    return minimise(replace(problem, held=True), x, max_steps=_TRAJECTORY_STEPS, tolerance=1e-5).x
+    return minimise(replace(problem, held=True), x, max_steps=_TRAJECTORY_STEPS, tolerance=1e-5, damping=DAMPING).x
 
 
 def left_by_sensor(problem: JointProblem, x: JointState) -> dict[str, tuple[Array, Array]]:

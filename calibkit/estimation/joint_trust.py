@@ -65,16 +65,9 @@ def joint_covariance(fit: JointFit, scales: Array) -> Covariance:
     A trajectory that bends to the noise on both sides of a block's ends takes from its score (white noise: 15 % of the variance), so what
     comes out below the plain one is not believed.
     """
-    S, scores, t = [], [], []
-    for part in fit.problem.parts(fit.x):
-        if part.kind != "stays":
-            information, score = projected(part, fit.drawn.core_answer)
-            S.append(information)
-            scores.append(score)
-            t.append(part.t_s)
-    together = np.concatenate(S)
-    prior = fit.drawn.S - together.sum(axis=0)
-    return covariance_in_time(together, np.concatenate(scores), np.concatenate(t), 1.0, scales, prior, least=1.0)
+    epochs = fit.epochs
+    prior = fit.drawn.S - epochs.information.sum(axis=0)
+    return covariance_in_time(epochs.information, epochs.score, epochs.t_s, 1.0, scales, prior, least=1.0)
 
 
 def bias_covariance(fit: JointFit, scales: Array) -> Array:

@@ -36,15 +36,15 @@ class Solution(Generic[X]):
     converged: bool
 
 
-def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-9) -> Solution[X]:
-    """Return a local minimum of the problem's cost from x.
+def minimise(problem: Problem[X], x: X, max_steps: int = 60, tolerance: float = 1e-9, damping: float = _FIRST_DAMPING) -> Solution[X]:
+    """Return a local minimum of the problem's cost from x; `damping` is the first.
 
     Converged when a step that damping has not shortened promises to lower the cost by less than `tolerance` of it, or by nothing.
     That step is still taken, unchecked: near the minimum its error is of second order. A cost that is not finite at the start gives
     an unconverged solution; the caller names the cause.
     """
     cost, system = problem.linearize(x)
-    damping, growth = _FIRST_DAMPING, 2.0
+    growth = 2.0
     for steps in range(max_steps):
         if not np.isfinite(cost) or damping > _MAX_DAMPING:
             return Solution(x, cost, steps, False)

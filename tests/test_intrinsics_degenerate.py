@@ -17,6 +17,7 @@ from calibkit.estimation.lens_verdict import judge_lens
 from calibkit.geometry import so3
 from calibkit.models.board import AprilGrid
 from calibkit.models.cameras import CAMERAS
+from calibkit.report.summary import look_at
 from calibkit.simulation.camera import SimCamera, place_board, random_board_poses
 from calibkit.simulation.corners import views_of_poses
 from calibkit.simulation.scenarios import SCENARIOS
@@ -29,7 +30,8 @@ SMALL = AprilGrid(4, 4, 0.13, 0.3)
 
 def calibrate(views: BoardViews, model: str | None = None) -> Result:
     """What the command makes of the views, the signals of the residuals included."""
-    return with_signals(calibrate_cameras([CameraRequest(views, model)]))
+    result = calibrate_cameras([CameraRequest(views, model)])
+    return with_signals(result, look_at([result]))
 
 
 @pytest.fixture

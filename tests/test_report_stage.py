@@ -14,8 +14,9 @@ from calibkit.data.verdict import Reason, Status, Verdict
 from calibkit.errors import BadInputError
 from calibkit.io.residual_file import save_residuals
 from calibkit.io.rig_file import save_rig, updated
+from calibkit.report.summary import summarise
 from calibkit.stages.outputs import Outputs
-from calibkit.stages.report import Files, report, write_report
+from calibkit.stages.report import Files, report, write_pages
 
 
 def save(made, path):
@@ -51,7 +52,7 @@ def test_the_stage_and_the_rig_file_give_the_same_pages(tmp_path, small):
     got = run(tmp_path / "rig.yaml", "-o", tmp_path / "later", "--json", tmp_path / "verdict.json")
     assert got.exit_code == 0, got.output
     assert got.output.splitlines()[-2].startswith("report: ")
-    write_report(type(small)(**{**small.__dict__, "rig": rig}), tmp_path / "at_once")
+    write_pages(summarise(rig, [replace(small, rig=rig)]), tmp_path / "at_once")
     later, at_once = (
         {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.*")}
         for folder in (tmp_path / "later", tmp_path / "at_once")

@@ -28,6 +28,7 @@ MAX_TOTAL_BYTES = 1 << 30  # unpacked: a thousand frames of 144 corners are 11 M
 MAX_HEADER_BYTES = 16 << 20  # as objects, JSON takes many times its size
 MAX_ENTRIES = 1000
 HEADER = "header.json"
+_SOME, _SHRUNK = 1 << 16, 0.75
 _FAST = 1  # of zlib's levels: the usual one takes twice the time for 2 % less
 Dtype = Literal["bool", "int32", "int64", "float64"]
 
@@ -177,9 +178,15 @@ def _pack(result: Result) -> bytes:
         for name, data in entries.items():
             info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             info.create_system, info.external_attr = 3, 0o644 << 16  # the same bytes on every system
-            info.compress_type = zipfile.ZIP_STORED if name.endswith(".jpg") else zipfile.ZIP_DEFLATED
+            info.compress_type = zipfile.ZIP_DEFLATED if _shrinks(data) else zipfile.ZIP_STORED
             archive.writestr(info, data, compresslevel=_FAST)
     return out.getvalue()
+
+
+def _shrinks(data: bytes) -> bool:
+    """Whether packing is worth its time, by the beginning: of measured numbers it takes a tenth off for two thirds of the time."""
+    some = data[:_SOME]
+    return len(zlib.compress(some, _FAST)) < _SHRUNK * len(some)
 
 
 def _portable(dtype: np.dtype[np.generic]) -> Dtype:

@@ -53,14 +53,30 @@ class Demands:
 NOTHING = Demands()
 
 
-def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (), demands: Demands = NOTHING) -> Summary:
+@dataclass(frozen=True)
+class Look:
+    """Results made ready to be read, and what is measured on them."""
+
+    views: tuple[View, ...]
+    signals: tuple[Signal, ...]
+
+
+def look_at(results: Sequence[Result]) -> Look:
+    """Return what there is to see in the results' residuals."""
+    seen = tuple(view for result in results for view in views(result))
+    return Look(seen, tuple(signal for view in seen for signal in measure(view)))
+
+
+def summarise(
+    rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (), demands: Demands = NOTHING, look: Look | None = None
+) -> Summary:
     """Return what the results and the rig file say of the rig: the gravest of all their verdicts, each reason once.
 
     What `earlier` ones leave is looked at, not judged, but limits may be set on it where no later one measures it. BadInputError for a
-    limit on what the rig does not have.
+    limit on what the rig does not have. `look` is that at the results, where it was taken before.
     """
-    seen = tuple(view for result in results for view in views(result))
-    signals = tuple(signal for view in seen for signal in measure(view))
+    look = look or look_at(results)
+    seen, signals = look.views, look.signals
     said = tuple(reason for result in results for reason in result.reasons)
     said += rig_reasons(rig, said)
     gone = [name for result in results for name in result.not_observable]
@@ -88,7 +104,7 @@ def summarise(rig: Rig, results: Sequence[Result], earlier: Sequence[Result] = (
 def _untold(earlier: Sequence[Result], signals: Sequence[Signal]) -> tuple[Signal, ...]:
     """Return what earlier stages measured and no later one did of the same sensor, as the held-out error of a lens that joint refined."""
     told = {(signal.sensor, signal.probe.key) for signal in signals}
-    found = {(s.sensor, s.probe.key): s for result in earlier for view in views(result) for s in measure(view)}
+    found = {(s.sensor, s.probe.key): s for s in look_at(earlier).signals}
     return tuple(signal for key, signal in found.items() if key not in told)
 
 

@@ -19,9 +19,7 @@ from calibkit.estimation.intrinsics import corner_set
 from calibkit.estimation.joint_result import residual_sets
 from calibkit.geometry.so3 import Array
 from calibkit.report.parameters import rows
-from calibkit.report.signals import measure
-from calibkit.report.summary import Summary
-from calibkit.report.view import views
+from calibkit.report.summary import Summary, look_at
 from calibkit.stages.diagnose import Diagnosed, Examined, sensors_of
 from calibkit.stages.diagnose_cameras import CamerasExamined
 from calibkit.stages.report import write_pages
@@ -95,9 +93,8 @@ class _Page:
         rms += [[each.sensor, f"{each.held:.3g}", f"{each.best:.3g}", each.unit] for each in diagnosed.rms]
         lines = [f"under test, on {diagnosed.what}", *diagnosed.not_tested]
         result = Result(self.stage, rig, tuple(reasons), self.sets, {**self.facts, "lines": lines, "tables": [rms, *tables], "found": told})
-        seen = tuple(views(result))
-        signals = tuple(signal for view in seen for signal in measure(view))
-        return Summary(rig, (result,), tuple(reasons), tuple(rows(rig)), seen, signals)
+        look = look_at([result])
+        return Summary(rig, (result,), tuple(reasons), tuple(rows(rig)), look.views, look.signals)
 
 
 def _with_temperature(found: Examined, residuals: ResidualSet) -> ResidualSet:

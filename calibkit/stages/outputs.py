@@ -14,10 +14,9 @@ from calibkit.errors import one_line
 from calibkit.io.atomic import refuse_unwritable, write_json
 from calibkit.io.residual_file import entry_hashes, save_residuals
 from calibkit.io.rig_file import load_rig, merge_rigs, save_rig, updated
-from calibkit.report.signals import measure, not_good
-from calibkit.report.summary import Summary, as_json, summarise
-from calibkit.report.view import views
-from calibkit.stages.report import FILES, check_out_dir, write_report
+from calibkit.report.signals import not_good
+from calibkit.report.summary import Look, Summary, as_json, look_at, summarise
+from calibkit.stages.report import FILES, check_out_dir, write_pages
 from calibkit.version import __version__
 
 
@@ -53,18 +52,18 @@ class Saved:
     files: tuple[Path, ...]
 
 
-def with_signals(result: Result) -> Result:
+def with_signals(result: Result, look: Look) -> Result:
     """Return the result with the signals of its residuals that are not good among its reasons, the cameras' own included."""
     rig, reasons = result.rig, list(result.reasons)
-    for view in views(result):
-        found = not_good(measure(view))
+    for sensor in dict.fromkeys(view.sensor for view in look.views):
+        found = not_good(signal for signal in look.signals if signal.sensor == sensor)
         reasons += found
-        camera = rig.cameras.get(view.sensor)
+        camera = rig.cameras.get(sensor)
         if camera is not None and found:
             order = [*found, *([] if camera.verdict is None else [replace(found[0], verdict=camera.verdict)])]
             texts = [*camera.reasons, *(reason.text for reason in found)]
             updated_camera = camera.model_copy(update={"verdict": worst(order), "reasons": texts})
-            rig = rig.model_copy(update={"cameras": {**rig.cameras, view.sensor: updated_camera}})
+            rig = rig.model_copy(update={"cameras": {**rig.cameras, sensor: updated_camera}})
     return replace(result, rig=rig, reasons=tuple(dict.fromkeys(reasons)))
 
 
@@ -113,7 +112,8 @@ def save(
     options: dict[str, str | float | int | bool | None],
 ) -> Saved:
     """Write everything that was asked for; the rig file last but for the report, so that it never names what is not there."""
-    result = with_losses(with_signals(result), base)
+    look = look_at([result])
+    result = with_losses(with_signals(result, look), base)
     files: list[Path] = []
     run = StageRun(
         stage=result.stage,
@@ -128,7 +128,7 @@ def save(
         run = run.model_copy(update={"residual_file": name, "residual_sha256": digest})
         files.append(outputs.out.parent / name)
     result = replace(result, rig=result.rig.model_copy(update={"provenance": [run]}))
-    summary = summarise(result.rig, [result])
+    summary = summarise(result.rig, [result], look=look)
     if outputs.out is not None:
         save_rig(updated(base, result.rig), outputs.out, force=True)  # `open` has refused what may not be replaced
         files.append(outputs.out)
@@ -136,6 +136,7 @@ def save(
         write_json(outputs.json, as_json(summary), outputs.force)
         files.append(outputs.json)
     if outputs.report is not None:
-        write_report(result, outputs.report, outputs.force)
+        check_out_dir(outputs.report, outputs.force)
+        write_pages(summary, outputs.report)
         files.append(outputs.report / FILES[0])
     return Saved(result, summary, tuple(files))

@@ -64,14 +64,6 @@ def report(rig_path: Path, files: Files = NONE, demands: Demands = NOTHING, stri
     return summary
 
 
-def write_report(result: Result, out_dir: Path, force: bool = False) -> Summary:
-    """Write the report of one stage's result: for every stage's `--report DIR`."""
-    check_out_dir(out_dir, force)
-    summary = summarise(result.rig, [result])
-    write_pages(summary, out_dir)
-    return summary
-
-
 def check_out_dir(out_dir: Path, force: bool = False) -> None:
     """Raise BadInputError where a report cannot be written into `out_dir`: to be asked before long work, too."""
     if out_dir.exists() and not out_dir.is_dir():

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calibkit.errors import BadInputError
 from calibkit.io.recording import open_recording
-from calibkit.io.ros_messages import IMU, KINDS, decode_imu, header_ns
+from calibkit.io.ros_messages import IMU, KINDS, STANDARD_MD5, decode_imu, header_ns, starts_with_header, typestore
 from calibkit.io.topic_pass import restamp
 from calibkit.io.unpack import unpack, zstd
 
@@ -217,6 +217,14 @@ def test_message_layouts_do_not_depend_on_the_ros_2_distribution() -> None:
     for kind in KINDS:
         seen = {repr(fields) for s in Stores if "ROS2" in s.name and (fields := get_typestore(s).fielddefs.get(kind))}
         assert len(seen) <= 1, kind
+
+
+def test_what_is_known_of_standard_types_is_as_rosbags_has_it() -> None:
+    store = typestore("ros1")
+    known = [kind for kind in KINDS if kind in store.fielddefs]
+    assert {kind: store.generate_msgdef(kind)[1] for kind in known} == STANDARD_MD5
+    headed = {kind for kind in known if store.fielddefs[kind][1][0][1][1] == "std_msgs/msg/Header"}
+    assert {kind for kind in known if starts_with_header(kind)} == headed
 
 
 def test_an_unknown_distribution_is_refused(tmp_path: Path) -> None:

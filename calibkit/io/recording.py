@@ -193,5 +193,5 @@ def open_recording(sources: list[Path], ros_distro: str | None = None, imu: ImuO
     """Open recordings of any kind as one, on one clock; what the files do not say is in `ros_distro` (of ROS 2) and `imu`."""
     if not sources:
         raise BadInputError("no recording is given: name a .bag, .mcap, .db3, a folder or a CSV file")
-    ros_messages.typestore(ros_distro)  # an unknown name is told before anything is read
+    ros_messages.check_distro(ros_distro)  # an unknown name is told before anything is read
     return Recording(open_sources(sources, ros_distro, imu))

@@ -136,7 +136,8 @@ class _Bag:
 
     def _pass(self, kinds: Mapping[str, str], progress: Progress, looks: Mapping[str, Look]) -> dict[str, Stamps]:
         """Read some topics at once, whatever their kinds."""
-        headed = {c for container in self.containers for c in container.counts if ros_messages.starts_with_header(c.type)}
+        channels = {c for container in self.containers for c in container.counts if c.topic in kinds}
+        headed = {c for c in channels if ros_messages.starts_with_header(c.type)}
         total = sum(topic.count for topic in self.source.topics if topic.name in kinds)
         passes = {name: TopicPass(kind, self.options) for name, kind in kinds.items()}
         for message in progress(self.messages(passes.keys()), "reading", total):
@@ -214,7 +215,7 @@ def bag_source(
             source.warn(warning)
         for channel, count in container.counts.items():
             counts[channel.topic, channel.type, channel.encoding] += count
-            standard = ros_messages.standard_md5(channel.type) if channel.md5 not in ("", "*") else None
+            standard = ros_messages.STANDARD_MD5.get(channel.type) if channel.md5 not in ("", "*") else None
             if standard and channel.md5 != standard:
                 source.warn(f"{channel.topic}: its definition of {channel.type} is not the standard one (md5 {one_line(channel.md5, 40)})")
     readers: dict[str, tuple[dict[str, Any], Any]] = {

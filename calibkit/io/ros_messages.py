@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from calibkit.errors import BadInputError, one_line
@@ -89,6 +89,9 @@ KINDS = {
     **dict.fromkeys(_VIDEO, "video"),
 }
 ENCODINGS = ("ros1", "cdr")
+_DISTROS = {store.value.split("_")[-1]: store for store in Stores if store not in (Stores.EMPTY, Stores.LATEST)} | {
+    "ros1": Stores.ROS1_NOETIC
+}
 
 
 def is_video(compressed_format: str) -> bool:
@@ -96,35 +99,50 @@ def is_video(compressed_format: str) -> bool:
     return any(name in compressed_format.lower() for name in _VIDEO_FORMATS)
 
 
+# ROS 1's checksums of the standard types (a test holds them against rosbags): to build its types takes a tenth of a second.
+STANDARD_MD5 = {
+    IMAGE: "060021388200f6f0f447d0fcd9c64743",
+    COMPRESSED: "8f7a12909da2c9d3332d540a0977563f",
+    IMU: "6a62c6daae103f4ff57a132d6f95cec2",
+    CAMERA_INFO: "c9a58c1b0b154e0e6da7578cb991d214",
+    "sensor_msgs/msg/PointCloud2": "1158d486dd51d683ce2f1be655c3c181",
+    "geometry_msgs/msg/PoseStamped": "d3812c3cbc69362b77dc0b19b345f8f5",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "953b798c0f514ff060a53a3498ce6246",
+    "nav_msgs/msg/Odometry": "cd5e73d190d741a2f92e81eda573aca7",
+    "geometry_msgs/msg/TransformStamped": "b5764a33bfeb3588febc2682852579b0",
+    "geometry_msgs/msg/TwistStamped": "98d34b0043a2093cf9d9345ab6eef12e",
+    "geometry_msgs/msg/TwistWithCovarianceStamped": "8927a1a12fb2607ceea095b2dc440a96",
+    _TF: "94810edda583a504dfda3829e70d7eec",
+}
+
+
 def starts_with_header(kind: str) -> bool:
     """Tell whether messages of a ROS type begin with a std_msgs/Header, as far as the standard types know."""
+    if kind in STANDARD_MD5:
+        return kind != _TF
     definition = typestore(None).fielddefs.get(kind)
     return bool(definition and definition[1] and definition[1][0][1][1] == "std_msgs/msg/Header")
+
+
+def check_distro(name: str | None) -> None:
+    """Raise BadInputError for a distribution that rosbags does not know."""
+    if name is not None and name not in _DISTROS:
+        raise BadInputError(f"--ros-distro {one_line(name, 40)} is not known: give one of {', '.join(sorted(_DISTROS))}")
 
 
 @lru_cache
 def typestore(distro: str | None) -> Typestore:
     """Return rosbags' types of a distribution: "ros1", a ROS 2 name, or the latest for None."""
-    known = {store.value.split("_")[-1]: store for store in Stores if store not in (Stores.EMPTY, Stores.LATEST)} | {
-        "ros1": Stores.ROS1_NOETIC
-    }
-    if distro is not None and distro not in known:
-        raise BadInputError(f"--ros-distro {one_line(distro, 40)} is not known: give one of {', '.join(sorted(known))}")
-    store = get_typestore(known[distro] if distro else Stores.LATEST)
+    check_distro(distro)
+    store = get_typestore(_DISTROS[distro] if distro else Stores.LATEST)
     if _TF not in store.fielddefs:  # rosbags has it for ROS 2 only; ROS 1's is the same
-        store.register({_TF: get_typestore(Stores.LATEST).fielddefs[_TF]})
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF))
     return store
 
 
 def known_distro(name: str | None) -> bool:
     """Tell whether rosbags has the types of a distribution."""
     return any(store.value.endswith(f"_{name}") for store in Stores)
-
-
-@lru_cache
-def standard_md5(kind: str) -> str | None:
-    """Return ROS 1's checksum of the standard definition of a type that is read here."""
-    return typestore("ros1").generate_msgdef(kind)[1] if kind in KINDS and kind in typestore("ros1").fielddefs else None
 
 
 def deserialize(payload: bytes, kind: str, encoding: str, distro: str | None) -> Any:

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from natsort import natsorted
 
 from calibkit.data.observations import ImageFrame, Lost
 from calibkit.data.progress import Progress
@@ -40,6 +39,8 @@ def stamp_ns(text: str) -> int | None:
 
 def image_folder(folder: Path, name: str) -> Source:
     """Return the images of a folder in natural order, with stamps where every file name is one."""
+    from natsort import natsorted  # slow to import
+
     files = natsorted((path for path in folder.iterdir() if is_image(path)), key=lambda path: path.name)
     stamps = [stamp_ns(path.stem) for path in files]
     source = Source(name, files)

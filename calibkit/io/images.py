@@ -3,17 +3,15 @@
 import io
 import warnings
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from types import ModuleType
 from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from calibkit.errors import BadInputError, one_line
 from calibkit.opencv import cv2
-
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # MAX_PIXELS is checked instead
 
 Gray = NDArray[np.uint8] | NDArray[np.uint16]
 MAX_PIXELS = 150_000_000  # of one image; the largest sensors have as many, and Pillow refuses more than 178 million
@@ -85,16 +83,26 @@ def decode_raw(width: int, height: int, encoding: str, bigendian: bool, step: in
     return np.array(gray)  # writable, and free of the message
 
 
+@cache
+def _pillow() -> ModuleType:
+    """Return Pillow's images: slow to import, and raw ones do without."""
+    from PIL import Image
+
+    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # MAX_PIXELS is checked instead
+    return Image
+
+
 def decode_compressed(data: bytes | NDArray[np.uint8], where: str) -> Gray:
     """Return an image file's bytes as gray (h, w), pixels as stored (an orientation tag is not obeyed)."""
+    pillow = _pillow()
     try:
-        with Image.open(io.BytesIO(bytes(data)), formats=_FORMATS) as header:
+        with pillow.open(io.BytesIO(bytes(data)), formats=_FORMATS) as header:
             width, height = header.size
     except (OSError, ValueError, SyntaxError) as error:
-        what = "damaged, or of another kind" if isinstance(error, UnidentifiedImageError) else one_line(error, 120)
+        what = "damaged, or of another kind" if isinstance(error, pillow.UnidentifiedImageError) else one_line(error, 120)
         reason = what if len(data) else "it is empty"
         raise BadInputError(f"{where}: not a readable image ({reason}); jpeg, png, bmp, pgm and tiff are read") from error
-    except Image.DecompressionBombError as error:
+    except pillow.DecompressionBombError as error:
         raise BadInputError(f"{where}: the image is too large; at most {MAX_PIXELS} pixels are read") from error
     if not 0 < width * height <= MAX_PIXELS:
         raise BadInputError(f"{where}: an image of {width} x {height} is too large; at most {MAX_PIXELS} pixels are read")

@@ -6,6 +6,7 @@ r = (uv - project(T_c_cam0 T_cam0_board p_board; lens_c)) / sigma
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -76,7 +77,7 @@ class CameraProblem:
     free_lens: bool = True
     free_rig: bool = True
 
-    @property
+    @cached_property
     def lens_slices(self) -> tuple[slice, ...]:
         """Where each camera's lens stands in the border."""
         ends = np.cumsum([len(c.model.parameter_names) for c in self.cameras])
@@ -100,7 +101,7 @@ class CameraProblem:
             cost, C[where, where], g[where] = cost + float(r @ r), J.T @ J, -J.T @ r
         return cost, C, g
 
-    @property
+    @cached_property
     def border_size(self) -> int:
         return int(self.lens_slices[-1].stop + 6 * (len(self.cameras) - 1))
 

@@ -22,6 +22,7 @@ OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
 NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
 BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
+_CLOSE = 1e-5  # of the cost: what a fit to be judged by its errors must be known to
 _POSE_LOSS = 8.0  # px: wide enough to bring a pose in from a far start
 _OUTERMOST = 99.9  # percentile of corners, a stray one left out
 _FINEST = 1e-6  # sigmas; perfect data leaves rounding alone, in which nothing stands out
@@ -136,7 +137,7 @@ def refit(fit: LensFit, frames: Sequence[Mask], lenses_of: LensFit | None = None
     if lenses_of is not None:
         state = replace(state, lenses=lenses_of.state.lenses, T_cam_cam0=lenses_of.state.T_cam_cam0)
         problem = replace(problem, free_lens=False, free_rig=False)
-    solution = minimise(problem, state)
+    solution = minimise(problem, state, tolerance=_CLOSE)
     return LensFit(
         tuple(views.select(rows) for views, rows in zip(fit.views, frames, strict=True)),
         problem,

@@ -22,6 +22,7 @@ OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
 NOISY_VIEW = 1.5  # a view this much noisier than the median (blur) is weighed down by what exceeds it
 BAD_VIEW = 6.0  # and one this much noisier is given up
 _ROBUST_ROUNDS = 3
+_SETTLED = 0.01  # of the noise: a further robust round would change nothing
 _CLOSE = 1e-5  # of the cost: what a fit to be judged by its errors must be known to
 _POSE_LOSS = 8.0  # px: wide enough to bring a pose in from a far start
 _OUTERMOST = 99.9  # percentile of corners, a stray one left out
@@ -186,8 +187,12 @@ def _solve(
     found = [camera.weight for camera in problem.cameras]
     if robust:
         # From px-wide tolerance inwards: the noise is unknown until most corners fit.
+        known, given_up = np.inf, len(dropped)
         for _ in range(_ROBUST_ROUNDS):
             scale = _noise(problem, state)
+            if abs(scale - known) <= _SETTLED * scale and len(dropped) == given_up:
+                break
+            known, given_up = scale, len(dropped)
             problem = _weigh_prior(problem, state)
             solution = minimise(replace(problem, loss_scale=2.5 * scale), state, max_steps=8, tolerance=1e-4)
             state = solution.x

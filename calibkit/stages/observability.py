@@ -54,7 +54,8 @@ class Observability:
             return "NOT OBSERVABLE: this motion does not tell all of the calibration"
         if any(row.status is Status.WEAK for row in self.rows):
             return "CHECK: this motion tells some of the calibration weakly"
-        return "PASS: this motion tells all of the calibration"
+        besides = "; what is marked above is not the motion's" if self.reasons else ""
+        return f"PASS: this motion tells all of the calibration{besides}"
 
     def as_json(self) -> dict[str, object]:
         """Return everything, for machines."""

@@ -16,7 +16,7 @@ from calibkit.estimation.diagnosis import Alone, Cause
 from calibkit.estimation.diagnosis_signature import Course, Signature, courses, signatures
 from calibkit.estimation.diagnosis_words import About, base_of, bending, named, number, unit_of
 from calibkit.estimation.intrinsics import corner_set
-from calibkit.estimation.joint_result import residual_sets
+from calibkit.estimation.joint_residuals import residual_sets
 from calibkit.geometry.so3 import Array
 from calibkit.report.parameters import rows
 from calibkit.report.summary import Summary, look_at

@@ -25,7 +25,8 @@ from calibkit.estimation.hand_eye_world import WORLD_METHODS
 from calibkit.geometry import se3, so3
 from calibkit.io.rig_file import load_rig
 from calibkit.report.parameters import rows
-from calibkit.report.summary import summarise, text
+from calibkit.report.summary import summarise
+from calibkit.report.summary_text import text
 
 Array = NDArray[np.float64]
 P, R = TRANSFORM_PARAMETERS[:3], TRANSFORM_PARAMETERS[3:]

@@ -22,7 +22,8 @@ from calibkit.io.rig_file import save_rig
 from calibkit.report.junit import junit
 from calibkit.report.limits import read
 from calibkit.report.markdown import escape, markdown
-from calibkit.report.summary import Demands, limit_cells, parameter_cells, signal_cells, summarise
+from calibkit.report.summary import Demands, summarise
+from calibkit.report.summary_text import limit_cells, parameter_cells, signal_cells
 
 SCHEMA = xmlschema.XMLSchema(Path(__file__).with_name("junit.xsd"))
 EVIL = (

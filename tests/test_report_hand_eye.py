@@ -22,7 +22,8 @@ from calibkit.report.figures import PICTURES, draw, plates
 from calibkit.report.hand_eye_figures import ELLIPSE
 from calibkit.report.page import build
 from calibkit.report.signals import measure
-from calibkit.report.summary import summarise, text
+from calibkit.report.summary import summarise
+from calibkit.report.summary_text import text
 from calibkit.report.view import View, views
 
 Array = NDArray[np.float64]

@@ -20,7 +20,8 @@ from calibkit.geometry import se3, so3
 from calibkit.opencv import cv2
 from calibkit.report.page import build
 from calibkit.report.parameters import number, rows
-from calibkit.report.summary import summarise, text
+from calibkit.report.summary import summarise
+from calibkit.report.summary_text import text
 
 EVIL = "<script>alert(1)</script>"
 

@@ -9,7 +9,8 @@ from report_samples import CX, CY, SIZE, residual_set, result
 from calibkit.data.verdict import Verdict
 from calibkit.report.field import _median_by, cells, over_image, over_radius
 from calibkit.report.signals import PROBES, measure, not_good
-from calibkit.report.summary import summarise, text
+from calibkit.report.summary import summarise
+from calibkit.report.summary_text import text
 from calibkit.report.view import views
 
 CENTRE = np.array([CX, CY])

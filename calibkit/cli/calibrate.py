@@ -47,7 +47,7 @@ def run(
     from calibkit.data.verdict import Verdict
     from calibkit.errors import one_line
     from calibkit.io.imu_options import ImuOptions
-    from calibkit.report.summary import text
+    from calibkit.report.summary_text import text
     from calibkit.stages.calibrate import Options, calibrate
     from calibkit.stages.intrinsics import AUTO
 

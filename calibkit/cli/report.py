@@ -68,7 +68,7 @@ def report(
     from calibkit.cli.paths import refuse_clashes
     from calibkit.data.verdict import Verdict
     from calibkit.errors import BadInputError, one_line
-    from calibkit.report.summary import text
+    from calibkit.report.summary_text import text
     from calibkit.stages import report as stage
     from calibkit.stages.limits_file import demands
 

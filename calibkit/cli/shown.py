@@ -13,7 +13,7 @@ def show(saved: "Saved", strict: bool) -> None:
     """Print a stage's outcome and leave with its exit code."""
     from calibkit.data.verdict import Verdict
     from calibkit.errors import one_line
-    from calibkit.report.summary import text
+    from calibkit.report.summary_text import text
 
     warnings = saved.result.facts.get("warnings")
     for warning in warnings if isinstance(warnings, list) else []:

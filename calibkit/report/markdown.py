@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 
 from calibkit.data.verdict import Verdict
 from calibkit.errors import one_line
-from calibkit.report.summary import Summary, about, camera_lines, limit_cells, parameter_cells, signal_cells, stage_lines
+from calibkit.report.summary import Summary
+from calibkit.report.summary_text import about, camera_lines, limit_cells, parameter_cells, signal_cells, stage_lines
 from calibkit.version import __version__
 
 MEANING = {

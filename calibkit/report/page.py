@@ -15,7 +15,8 @@ from calibkit.errors import one_line
 from calibkit.report.figures import PICTURES, Chapter, Drawn, Plate, draw, plates
 from calibkit.report.markdown import MEANING, markdown
 from calibkit.report.parameters import sigma_note
-from calibkit.report.summary import Summary, about, as_json, camera_lines, limit_cells, stage_lines, stage_tables
+from calibkit.report.summary import Summary, as_json
+from calibkit.report.summary_text import about, camera_lines, limit_cells, stage_lines, stage_tables
 from calibkit.version import __version__
 
 _EARLIER = "A later stage has found this anew: the numbers above are that one's."

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,11 @@ class Part:
         return self.first[:, None] + self.offsets
 
 
+@lru_cache
+def _lower(q: int) -> tuple[Index, Index]:
+    return np.tril_indices(q)
+
+
 def assemble(parts: Iterable[Part], knots: int, knot: int, width: int, p: int) -> tuple[float, Arrowhead]:
     """Return the cost and the normal equations of all parts; a knot has so many unknowns, and width knots meet in the core."""
     size, cost = knot * knots, 0.0
@@ -40,8 +46,8 @@ def assemble(parts: Iterable[Part], knots: int, knot: int, width: int, p: int) -
     for part in parts:
         q, touch = len(part.offsets), part.touch
         column = part.columns
-        rows, columns = np.tril_indices(q)  # lower storage: ab[row - column, column]
-        place = ((part.offsets[rows] - part.offsets[columns]) * size)[None] + column[:, columns]
+        rows, columns = _lower(q)  # lower storage: ab[row - column, column]
+        place = part.first[:, None] + (part.offsets[columns] + (part.offsets[rows] - part.offsets[columns]) * size)
         np.add.at(band, place.ravel(), part.N[:, rows, columns].ravel())
         np.add.at(g_x, column.ravel(), part.N[:, :q, -1].ravel())
         if len(touch):

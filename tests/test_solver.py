@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from calibkit.solver.arrowhead import Arrowhead, BlockDiagonal
 from calibkit.solver.levenberg_marquardt import minimise
-from calibkit.solver.robust import cauchy, scale_of_norms
+from calibkit.solver.robust import cauchy, scale_of_norms, scales_of_norms
 from calibkit.solver.trust import Covariance, covariance, covariance_in_time, directions, grade
 
 M, K, P, ROWS = 5, 6, 4, 20
@@ -274,3 +274,11 @@ def test_the_noise_is_read_off_a_median_that_outliers_do_not_move():
     norms[:1000] = 50.0
     assert scale_of_norms(norms) == pytest.approx(0.2, rel=0.06)
     assert scale_of_norms(np.zeros(0)) == 0.0
+
+
+def test_scales_by_row_are_those_of_each_row() -> None:
+    rng = np.random.default_rng(0)
+    norms = rng.random((40, 7))
+    seen = rng.random(norms.shape) < np.linspace(0, 1, 40)[:, None]
+    one_by_one = [scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(norms, seen, strict=True)]
+    np.testing.assert_allclose(scales_of_norms(norms, seen), one_by_one, rtol=1e-14)

@@ -22,7 +22,7 @@ from calibkit.estimation.lens_trust import biased
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
-from calibkit.solver.robust import scale_of_norms
+from calibkit.solver.robust import scales_of_norms
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Corners:
         every = replace(self.grid, weight=self.found)
         left = CameraProblem(self.points, (every,)).residuals(self._state(M), 0)
         size = np.linalg.norm(left.px, axis=2) * self.found
-        limit = OUTLIER * np.array([max(scale_of_norms(row[seen]), 1.0) for row, seen in zip(size, left.seen, strict=True)])
+        limit = OUTLIER * np.maximum(scales_of_norms(size, left.seen), 1.0)
         return replace(self, grid=replace(self.grid, weight=np.where(left.seen & (size <= limit[:, None]), self.found, 0.0)))
 
     def rms(self, M: Array) -> tuple[float, float]:

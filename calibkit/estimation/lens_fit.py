@@ -15,7 +15,7 @@ from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.models.cameras import CAMERAS
 from calibkit.solver.levenberg_marquardt import minimise
-from calibkit.solver.robust import scale_of_norms
+from calibkit.solver.robust import scale_of_norms, scales_of_norms
 
 MIN_CORNERS = 6  # a view's pose alone takes six numbers
 OUTLIER = 4.5  # in sigmas of the view: one honest corner in 25 000
@@ -256,7 +256,7 @@ def _judge_views(
     kept, grids = [], []
     for c, (views, grid) in enumerate(zip(used, problem.cameras, strict=True)):
         z, seen = _normalised(problem, state, c, found[c])
-        scale = np.array([scale_of_norms(row[mask]) if mask.any() else np.inf for row, mask in zip(z, seen, strict=True)])
+        scale = scales_of_norms(z, seen)
         typical = max(float(np.median(scale)), _FINEST)
         if not np.isfinite(typical):
             raise NotConvergedError(f"{views.camera}: {grid.model.name} sees most boards nowhere: try another --model")

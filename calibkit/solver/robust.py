@@ -17,3 +17,12 @@ def cauchy(s: Array, scale: float) -> tuple[Array, Array]:
 def scale_of_norms(norms: Array) -> float:
     """Return sigma per coordinate from the median of 2-vectors' lengths: Rayleigh's median is sigma sqrt(2 ln 2)."""
     return float(np.median(norms) / np.sqrt(2 * np.log(2))) if len(norms) else 0.0
+
+
+def scales_of_norms(norms: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return `scale_of_norms` of each row of norms (f, n), of what is seen there (f, n); inf where nothing is."""
+    count, row = seen.sum(axis=1), np.arange(len(norms))
+    in_order = np.sort(np.where(seen, norms, np.inf), axis=1)
+    middle = (in_order[row, np.maximum(count - 1, 0) // 2] + in_order[row, np.minimum(count // 2, norms.shape[1] - 1)]) / 2
+    out: Array = middle / np.sqrt(2 * np.log(2))
+    return out

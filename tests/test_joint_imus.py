@@ -10,7 +10,8 @@ from test_joint_honest import band, rms
 
 from calibkit.data.observations import ImuSamples
 from calibkit.data.result import Result
-from calibkit.data.verdict import Verdict
+from calibkit.data.verdict import Status, Verdict
+from calibkit.errors import BadInputError
 from calibkit.estimation.joint import Joint
 from calibkit.estimation.joint_trust import joint_trust
 from calibkit.geometry import se3, so3
@@ -112,8 +113,39 @@ def test_the_same_imu_twice_sits_in_one_place() -> None:
     assert np.all(np.abs(np.append(se3.local(np.eye(4), x.T_imu_ref), x.dt)) < 0.05 * sigma)  # where the solver stops
 
 
-def test_a_second_imu_of_another_unit_is_named() -> None:
+SWAP, FLIP, ROUND = np.eye(3)[[1, 0, 2]], np.diag([1.0, 1.0, -1.0]), np.eye(3)[[1, 2, 0]]
+HAS = "has its axes wrong: its x, y, z are imu1's"
+WRONG: dict[str, tuple[Array, Array, str]] = {
+    "gyroscope swapped": (SWAP, np.eye(3), f"imu1's gyroscope {HAS} y, x, z by all other data; they are no right-handed frame"),
+    "accelerometer swapped": (np.eye(3), SWAP, f"imu1's accelerometer {HAS} y, x, z by all other data; they are no right-handed"),
+    "accelerometer flipped": (np.eye(3), FLIP, f"imu1's accelerometer {HAS} x, y, -z by all other data; they are no right-handed"),
+    "accelerometer turned": (np.eye(3), ROUND, f"imu1's accelerometer {HAS} y, z, x by all other data: mend the driver"),
+    "both swapped": (SWAP, SWAP, "imu1's axes are no right-handed frame by all other data: one is flipped, or two are swapped"),
+    "in g": (np.eye(3), np.eye(3) / 9.80665, "imu1's accelerometer reads 0.102 times what all other data have it: is it in g?"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_with_a_second_imu_is_named_and_costs_the_first_nothing(name: str) -> None:
+    gyro, accel, why = WRONG[name]
+    recording = recorded(4, 20.0)
+    imu = second_imu(recording.session, 4, T_IMU0_IMU1, DT)
+    joint, result, text = told(recording, replace(imu, gyro=imu.gyro @ gyro.T, accel=imu.accel @ accel.T))
+    assert why in text
+    T, dt = result.rig.transforms["T_imu1_imu0"], result.rig.time_offsets["dt_imu0_imu1"]
+    assert T.status is Status.NOT_OBSERVABLE
+    assert dt.offset.value is None
+    assert T.verdict is dt.verdict is Verdict.FAIL
+    assert result.rig.transforms["T_cam0_imu0"].verdict is Verdict.PASS
+    of_camera = joint.fit.problem.border.camera(0)
+    z = error_of(recording, joint)[of_camera] / np.sqrt(np.diag(joint_trust(joint.fit).cov))[of_camera]
+    assert np.abs(z).max() < 4
+
+
+def test_a_second_imu_in_deg_per_s_or_of_another_scale_is_named() -> None:
     recording = recorded(4)
     imu = second_imu(recording.session, 4, T_IMU0_IMU1, DT)
+    with pytest.raises(BadInputError, match=r"a further IMU turns 57 times as fast as the reference IMU: a gyroscope in deg/s"):
+        recording.fitted(beside=[replace(imu, gyro=np.degrees(imu.gyro))])
     _, _, text = told(recording, replace(imu, accel=imu.accel * 1.2))
     assert "imu1's accelerometer is" in text

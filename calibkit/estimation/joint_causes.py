@@ -9,7 +9,7 @@ from calibkit.data.verdict import Reason, Verdict
 from calibkit.estimation.joint import Joint
 from calibkit.estimation.joint_frozen import WORDS
 from calibkit.estimation.joint_problem import JointProblem
-from calibkit.estimation.joint_state import JointState
+from calibkit.estimation.joint_state import JointState, of_imu
 from calibkit.estimation.stamps import StampReport
 from calibkit.geometry import so3
 from calibkit.geometry.so3 import Array
@@ -38,21 +38,26 @@ class Read:
         return out
 
 
-def wrong_sensors(joint: Joint, imu: str) -> dict[str, str]:
-    """Name, by kind, another unit or swapped or flipped axes of gyroscope and accelerometer, where their residuals ask for it."""
-    asked = [kind for kind in WORDS if joint.fit.factors[kind] > _NOISY]
+def wrong_sensors(joint: Joint, imu: str, j: int = 0) -> dict[str, str]:
+    """Name, by kind, another unit or swapped or flipped axes of IMU j's sensors, where their residuals ask for it."""
+    asked = [kind for kind in WORDS if joint.fit.factors[of_imu(kind, j)] > _NOISY]
     if not asked:
         return {}
-    found = {kind: reading(joint.fit.problem, joint.fit.x) for kind, reading in _READINGS.items()}
+    found = {kind: reading(joint.fit.problem, joint.fit.x, j) for kind, reading in _READINGS.items()}
     told = {kind: read for kind, read in found.items() if read.explained > _EXPLAINED}
     out = {kind: text for kind in asked if kind in told and (text := _unit(kind, told[kind], imu))}
     if out:
         return out
     axes = {kind: read.orthogonal for kind, read in told.items()}
     mirrored = [kind for kind, Q in axes.items() if np.linalg.det(Q) < 0]
+    if j and len(mirrored) == len(WORDS):  # how it lies on the rig, nobody says
+        text = f"{imu}'s axes are no right-handed frame by all other data: one is flipped, or two are swapped: mend the driver"
+        return dict.fromkeys(mirrored, text)
+    base = axes_of_rig = joint.fit.x.imus[j].T_imu_ref[:3, :3]
     if mirrored:  # what the other shows is that the rig's axes followed the mirrored one
-        return {kind: _wrong(kind, Q @ _other(axes, kind).T, imu) for kind, Q in axes.items() if kind in mirrored}
-    return {kind: _wrong(kind, axes[kind], imu) for kind in asked if kind in axes and np.linalg.norm(so3.log(axes[kind])) > _TURNED}
+        base = next((Q for kind, Q in axes.items() if kind not in mirrored), axes_of_rig)
+    strange = mirrored or [kind for kind in asked if kind in axes and np.linalg.norm(so3.log(axes[kind] @ base.T)) > _TURNED]
+    return {kind: _wrong(kind, axes[kind] @ base.T, imu, f"{imu}'s" if j else "the rig's") for kind in strange}
 
 
 def _unit(kind: str, read: Read, imu: str) -> str:
@@ -64,14 +69,9 @@ def _unit(kind: str, read: Read, imu: str) -> str:
     )
 
 
-def _other(axes: dict[str, Array], kind: str) -> Array:
-    """Return the other sensor's axes, the identity where they are not told or mirrored, too."""
-    return next((Q for other, Q in axes.items() if other != kind and np.linalg.det(Q) > 0), np.eye(3))
-
-
-def _wrong(kind: str, Q: Array, imu: str) -> str:
+def _wrong(kind: str, Q: Array, imu: str, whose: str) -> str:
     hand = "; they are no right-handed frame" if np.linalg.det(Q) < 0 else ""
-    return f"{imu}'s {WORDS[kind]} has its axes wrong: its x, y, z are the rig's {_axes(Q)} by all other data{hand}: mend the driver"
+    return f"{imu}'s {WORDS[kind]} has its axes wrong: its x, y, z are {whose} {_axes(Q)} by all other data{hand}: mend the driver"
 
 
 def _axes(Q: Array) -> str:
@@ -83,24 +83,26 @@ def _axes(Q: Array) -> str:
     return ", ".join(f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(*best, strict=True))
 
 
-def _gyro(problem: JointProblem, x: JointState) -> Read:
-    i, u = problem.knots.locate(problem.imu.t)
+def _gyro(problem: JointProblem, x: JointState, j: int) -> Read:
+    rows = problem.imus[j]
+    i, u = problem.knots.locate(rows.t + x.imus[j].dt)
     at = turning(x.R, Steps.of(x.R), i, basis(problem.knots, u), basis(problem.knots, u, 1), jacobians=False)
-    return _regress(problem.imu.gyro, at.omega, np.ones((len(i), 1)))
+    return _regress(rows.gyro, at.omega, np.ones((len(i), 1)))
 
 
-def _accel(problem: JointProblem, x: JointState) -> Read:
+def _accel(problem: JointProblem, x: JointState, j: int) -> Read:
     """Regress on R^T p''; gravity and lever arm, wrong where the accelerometer is, add what is linear in R's entries and in those of E.
 
     a + E l is the acceleration of the point at l of a body that turns: E = hat(domega/dt) + hat(omega)^2.
     """
-    i, u = problem.knots.locate(problem.imu.t)
+    rows = problem.imus[j]
+    i, u = problem.knots.locate(rows.t + x.imus[j].dt)
     at = turning(x.R, Steps.of(x.R), i, basis(problem.knots, u), basis(problem.knots, u, 1), jacobians=False)
     a = np.einsum("nl,nlk->nk", basis(problem.knots, u, 2), x.p[i[:, None] + np.arange(problem.knots.order)])
     body = np.einsum("nji,nj->ni", at.R, a)
     turn = so3.hat(at.omega)
-    E = so3.hat(np.gradient(at.omega, problem.imu.t, axis=0)) + turn @ turn
-    return _regress(problem.imu.accel, body, np.concatenate([at.R.reshape(-1, 9), E.reshape(-1, 9), np.ones((len(i), 1))], axis=1))
+    E = so3.hat(np.gradient(at.omega, rows.t, axis=0)) + turn @ turn
+    return _regress(rows.accel, body, np.concatenate([at.R.reshape(-1, 9), E.reshape(-1, 9), np.ones((len(i), 1))], axis=1))
 
 
 def _regress(measured: Array, true: Array, beside: Array) -> Read:

@@ -12,6 +12,7 @@ from calibkit.data.verdict import Status
 from calibkit.estimation.added_motion import AddedMotion
 from calibkit.estimation.hand_eye_known import parameter_statuses
 from calibkit.estimation.joint import CameraInput, Joint
+from calibkit.estimation.joint_causes import wrong_sensors
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_fit import corner_residuals
 from calibkit.estimation.joint_imu import NamedImu, intrinsics_of
@@ -26,6 +27,7 @@ from calibkit.geometry.so3 import Array
 from calibkit.solver.trust import grade
 
 STAGE = "joint"
+_NOTHING_KNOWN = 1e9  # times the sigma
 
 
 def joint_result(
@@ -45,7 +47,9 @@ def joint_result(
         joint = replace(joint, rival=None)
     trust = spread(trust, joint.rival)
     names, imu = tuple(each.views.camera for each in cameras), imus[0].name
-    judged = judge_joint(joint, trust, checks, cameras, imus, stamps)
+    wrong = [wrong_sensors(joint, each.name, j) for j, each in enumerate(imus)]
+    trust = _distrusted(joint, trust, [j for j, sensors in enumerate(wrong) if j and sensors])
+    judged = judge_joint(joint, trust, checks, cameras, imus, stamps, wrong)
     fit, border = joint.fit, joint.fit.problem.border
     rig = Rig()
     unknown: list[str] = []
@@ -98,6 +102,13 @@ def _add_pose(
     rig.time_offsets[dt] = make_time_offset(b, a, _estimate(offset, "s", trust, k, status), **told[dt])
     open_ = [f"{T}.{key}" for key, value in statuses.items() if value is Status.NOT_OBSERVABLE]
     return [*open_, *([f"{dt}.offset"] if status is Status.NOT_OBSERVABLE else [])]
+
+
+def _distrusted(joint: Joint, trust: Trust, imus: Sequence[int]) -> Trust:
+    """Return the trust with nothing known of where some further IMUs sit and when they sample: they contradict all other sensors."""
+    grown = np.ones(len(trust.cov))
+    grown[joint.fit.problem.border.at(f"{part} {j}" for j in imus for part in ("T_imu", "dt_imu"))] = _NOTHING_KNOWN
+    return replace(trust, cov=trust.cov * grown[:, None] * grown) if imus else trust
 
 
 def _tells_an_offset(joint: Joint, trust: Trust) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from calibkit.data.plural import counted
 from calibkit.data.verdict import Reason, Status, Verdict, worst
 from calibkit.estimation.joint import CameraInput, Joint
-from calibkit.estimation.joint_causes import jittering, wrong_sensors
+from calibkit.estimation.joint_causes import jittering
 from calibkit.estimation.joint_checks import Checks
 from calibkit.estimation.joint_frozen import WORDS
 from calibkit.estimation.joint_gaps import gaps_of_camera, gaps_of_imu, never_together
@@ -62,9 +62,15 @@ class Judged:
 
 
 def judge_joint(
-    joint: Joint, trust: Trust, checks: Checks, cameras: Sequence[CameraInput], imus: Sequence[NamedImu], stamps: dict[str, StampReport]
+    joint: Joint,
+    trust: Trust,
+    checks: Checks,
+    cameras: Sequence[CameraInput],
+    imus: Sequence[NamedImu],
+    stamps: dict[str, StampReport],
+    wrong_imus: Sequence[dict[str, str]],
 ) -> Judged:
-    """Return what is known of the cameras and of the IMUs."""
+    """Return what is known of the cameras and of the IMUs; `wrong_imus` are each IMU's sensors that contradict all others, and why."""
     fit, names, imu = joint.fit, tuple(each.views.camera for each in cameras), imus[0].name
     border = fit.problem.border
     sigma = np.sqrt(np.diag(trust.cov)) / trust.scales
@@ -97,24 +103,25 @@ def judge_joint(
         if j:
             found, more = _of_beside(joint, trust, statuses, (each.name, imu), j, stamps)
             opens_of_imus.append(found)
+            if wrong_imus[j]:
+                more = {key: _follows(key, those) for key, those in more.items()}
             reasons |= more
     sensors = (*names, *(each.name for each in imus))
-    wrong = _contradicting(joint, statuses, names, imu)
+    wrong = _never_together(joint, statuses, names, imu) or list(wrong_imus[0].values())
     if wrong:  # what they leave open is no lack of motion
         reasons |= {key: _follows(key, each) for key, each in reasons.items() if key not in sensors}
-    reasons[""] = _of_all(joint, checks, sensors[len(names) :], any(cause is not None for cause in jitter), wrong)
+    reasons[""] = _of_all(joint, checks, sensors[len(names) :], any(cause is not None for cause in jitter), wrong, wrong_imus)
     reasons = {key: reasons[key] for key in sorted(reasons, key=lambda key: _rank(key, sensors))}
     return Judged(
         tuple(statuses), tuple(opens), tuple(opens_of_imus), {key: tuple(dict.fromkeys(each)) for key, each in reasons.items()}, bool(wrong)
     )
 
 
-def _contradicting(joint: Joint, statuses: Sequence[Status], names: tuple[str, ...], imu: str) -> list[str]:
-    """Name sensors that cannot be brought together, and why."""
+def _never_together(joint: Joint, statuses: Sequence[Status], names: tuple[str, ...], imu: str) -> list[str]:
+    """Name sensors that were never recorded at once."""
     border, strange = joint.fit.problem.border, joint.fit.factors["gyro"] > _NOISIER["gyro"][1]
     lost = [c for c in range(len(names)) if strange or statuses[border[f"dt {c}"].start] is Status.NOT_OBSERVABLE]
-    apart = [text for c in lost if (text := never_together(joint, c, names[c], imu))]
-    return apart or list(wrong_sensors(joint, imu).values())
+    return [text for c in lost if (text := never_together(joint, c, names[c], imu))]
 
 
 def _follows(key: str, reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
@@ -250,7 +257,9 @@ def _of_corners(joint: Joint, names: tuple[str, ...], c: int) -> tuple[Reason, .
     return tuple(found)
 
 
-def _of_all(joint: Joint, checks: Checks, imus: tuple[str, ...], jitter: bool, wrong: list[str]) -> tuple[Reason, ...]:
+def _of_all(
+    joint: Joint, checks: Checks, imus: tuple[str, ...], jitter: bool, wrong: list[str], wrong_imus: Sequence[dict[str, str]]
+) -> tuple[Reason, ...]:
     fit, imu = joint.fit, imus[0]
     found = []
     if not fit.converged:
@@ -258,7 +267,9 @@ def _of_all(joint: Joint, checks: Checks, imus: tuple[str, ...], jitter: bool, w
     if wrong:
         found = [Reason(Verdict.FAIL, text) for text in wrong]
     else:
-        asked = [(i, kind, name, j) for j, name in enumerate(imus) for i, kind in enumerate(WORDS) if j or not jitter]
+        found += [Reason(Verdict.FAIL, text) for each in wrong_imus for text in dict.fromkeys(each.values())]
+        kinds = [(i, kind, name, j) for j, name in enumerate(imus) for i, kind in enumerate(WORDS) if not wrong_imus[j]]
+        asked = [each for each in kinds if each[-1] or not jitter]
         found += [reason for each in asked for reason in _of_samples(joint, *each)]
         found += _of_scale(joint, checks, imu)
     found += gaps_of_imu(joint, imu)

@@ -94,7 +94,7 @@ class CameraImu(CamerasRead):
         """Return the joint estimate; BadInputError names the recording and the sensors."""
         try:
             beside = [
-                ImuGiven(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras)
+                ImuGiven(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras, each.name)
                 for each in self.imus[1:]
             ]
             return calibrate_joint(cameras, self.imu.input.samples, _noise(self.imu.known), settings, progress, beside)

@@ -390,6 +390,8 @@ def test_stated_units_are_believed_or_contradicted(tmp_path: Path) -> None:
         ([{"robot": entries("matrices")[0], "camera": entries("matrices")[0]}], ["a second pose beside"]),
         ([{"pose": entries("numbers")[0], "x": 1}], ["names x twice"]),
         ({"version": 1}, ["holds no poses"]),
+        ({"poses": [], "unit": "m"}, ["holds no poses"]),
+        ([[]], ["holds no poses"]),
         ([True], ["'True' is not a number"]),
         ([[1e999] * 16], ["inf"]),
     ],

@@ -52,9 +52,9 @@ def read_document(path: Path, side: int | None = None) -> PoseRows:
     """Return the poses of a YAML or JSON file, of pairs of poses those of one side (0 or 1); BadInputError where it holds none."""
     document = load_yaml(path, _MAX_BYTES)
     entries = _entries(document, side)
-    if not entries:
-        raise document.error((), "holds no poses: wanted is a list of 4x4 matrices, of {position, orientation}, or image names with poses")
     poses = [_pose(document, entry) for entry in entries]
+    if not poses or not poses[0].numbers:
+        raise document.error((), "holds no poses: wanted is a list of 4x4 matrices, of {position, orientation}, or image names with poses")
     first = poses[0]
     for entry, pose in zip(entries, poses, strict=True):
         if (pose.columns, len(pose.numbers)) != (first.columns, len(first.numbers)):

@@ -128,6 +128,9 @@ NAMED: dict[str, tuple[Callable[[int], Recording], str]] = {
     ),
 }
 ALIKE = {
+    "3 s without images",
+    "one zero stamp",
+    "5 s late",
     "10 ms of jitter",
     "one acceleration of 400",
     "one stamp 50 ms off",

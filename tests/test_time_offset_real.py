@@ -53,6 +53,7 @@ def test_motion_capture_whose_fast_motion_is_not_the_cameras(data_dir: Path, par
     assert fit.sigma < 0.006
 
 
+@pytest.mark.slow
 def test_two_recordings_that_have_nothing_in_common(data_dir: Path) -> None:
     phone, hand = (open_recording([data_dir / f"pose_streams/{name}.csv"]).poses(name) for name in ("tango_MARS", "vicon_hand"))
     fit = fit_time_offset(turns_of_poses(phone), hand, Settings())

@@ -118,6 +118,7 @@ def test_units_and_gzip_and_no_times(run: Run, tmp_path: Path) -> None:
         assert others[axis].white.value == pytest.approx(noise.white.value, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_what_spoils_a_recording_is_named_and_cut(run: Run, tmp_path: Path) -> None:
     samples = rest(600)
     t = np.arange(len(samples)) / RATE

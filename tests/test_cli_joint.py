@@ -66,6 +66,7 @@ def test_transform_offset_and_lens_come_out_with_their_signs(run: Run, session: 
     assert re.search(r"timeshift_cam_imu: 0\.02", (tmp_path / "kalibr" / "camchain.yaml").read_text())
 
 
+@pytest.mark.slow
 def test_the_imus_known_intrinsics_are_used(run: Run, session: Session, files: Path, tmp_path: Path) -> None:
     model = ImuModel(M_a=np.diag([1.05, 0.97, 1.02]), M_g=np.diag([0.96, 1.03, 1.04]))
     assert session.imu is not None

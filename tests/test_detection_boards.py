@@ -117,6 +117,7 @@ def test_kuka_checkerboards(data_dir: Path) -> None:
     assert rms <= 0.104
 
 
+@pytest.mark.slow
 def test_fisheye_checkerboards(data_dir: Path) -> None:
     board = Checkerboard(9, 6, 0.12, 0.12)
     found = [detect(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), board) for path in sorted((data_dir / "mei_fisheye").glob("*.png"))]

@@ -427,6 +427,7 @@ def read(data_dir: Path, name: str) -> PoseStream:
     return stream_of(name, open_recording([data_dir / "pose_streams" / f"{name}.csv"]).poses(name))
 
 
+@pytest.mark.slow
 def test_motion_capture_and_camera(data_dir: Path) -> None:
     hand, cam = read(data_dir, "vicon_hand"), read(data_dir, "camera_in_target")
     half = len(cam.t_ns) // 2

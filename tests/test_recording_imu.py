@@ -262,6 +262,7 @@ print(len(imu.t_ns), imu.t_ns.nbytes + imu.gyro.nbytes + imu.accel.nbytes, (afte
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in kB on Linux")
+@pytest.mark.slow
 def test_memory_stays_near_that_of_the_arrays(tmp_path: Path) -> None:
     n, payload = 150_000, ImuPayload(np.zeros(3), np.array([0, 0, 9.81]))
     samples = (Sample(T0 + i * 5_000_000, T0 + i * 5_000_000, payload) for i in range(n))

@@ -85,6 +85,7 @@ def test_text_from_files_is_escaped():
     assert Checker(html).open == []
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes_whatever_the_user_s_settings():
     first = pages(result(residuals=residual_set(frames=10), thumbnails=1))
     with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "yellow", "svg.hashsalt": None}):

@@ -135,6 +135,7 @@ def test_residuals_of_an_entry_that_a_later_stage_made_anew_are_left_out(tmp_pat
     assert summary.verdict is Verdict.PASS
 
 
+@pytest.mark.slow
 def test_an_existing_report_is_kept_unless_forced(tmp_path, small):
     save(small, tmp_path / "rig.yaml")
     report(tmp_path / "rig.yaml", Files(tmp_path / "out"))

@@ -304,6 +304,7 @@ def test_windows_that_scatter_beyond_their_sigma(scatter, verdict, mark):
     assert (signal.verdict, signal.mark) == (verdict, mark)
 
 
+@pytest.mark.slow
 def test_one_section_of_the_page_holds_them_in_reading_order():
     made = result()
     files = build(summarise(made.rig, [made]))

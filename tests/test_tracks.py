@@ -177,6 +177,7 @@ def on_the_board(tracks: FeatureTracks, run: Session) -> Array:
     return out
 
 
+@pytest.mark.slow
 def test_rendered_board_is_followed_and_tells_the_turns() -> None:
     scenario = SCENARIOS["cam-imu"]
     run = simulate_session(replace(scenario, duration_s=3.0, cameras=(replace(scenario.cameras[0], rate_hz=20.0),)), 0)

@@ -154,7 +154,8 @@ def symmetry(image: Smoothed, uv: Array, maps: LocalMaps, radius: float, bright:
     sigma = _sigma(fit.residual / (_WEIGHT**2).sum() / 2, fit.gain, scale[:, None, None] ** 2 * metric, ok)
     if ok.any():
         ok &= sigma < _MUCH_WORSE * middling(sigma[ok])
-    return CornerFit(fit.uv - _drawn_by_blur(maps), sigma, ok)
+    corner = fit.uv - _drawn_by_blur(maps)
+    return CornerFit(corner, sigma, ok & np.isfinite(corner).all(1))
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class _Descent:
 def _descend(image: Smoothed, uv: Array, points: Array, light: Array | None, iterations: int) -> _Descent:
     """Move corners uv (n, 2) by Gauss-Newton; points (2, n, 2 pairs) px are the windows, `light` is found where it is None."""
     u, v = uv.T[:, :, None] + points
+    # OpenCV's samples, rounded to 1/32 px, are good enough to steer by; the last step's are not rounded
     right, left, below, above = (_near(image, u + x, v + y) for x, y in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
     if light is None:
         slope = _light_slope(uv, (right + left + below + above).sum(1) / len(_HALF))
@@ -182,8 +184,8 @@ def _descend(image: Smoothed, uv: Array, points: Array, light: Array | None, ite
     xx, yy = xx + stiff, yy + stiff
     gain = np.stack([yy * x - xy * y, xx * y - xy * x], axis=1) / (xx * yy - xy**2)[:, None]
     uv = uv.copy()
-    for left_over in reversed(range(iterations)):
-        values = (_near if left_over else _at)(image, uv[:, :1] + points[0], uv[:, 1:] + points[1]) * light
+    for to_come in reversed(range(iterations)):
+        values = (_near if to_come else _at)(image, uv[:, :1] + points[0], uv[:, 1:] + points[1]) * light
         odd_part = _difference(values) * _WEIGHT
         step = np.clip((gain @ odd_part[..., None])[..., 0], -1, 1)
         uv -= step

@@ -26,7 +26,7 @@ from calibkit.estimation.joint_state import ImuState, JointState
 from calibkit.estimation.lens_fit import dense_views, rows_of
 from calibkit.estimation.time_offset import Settings as TurnSettings
 from calibkit.estimation.time_offset import TimeOffsetFit, fit_time_offset
-from calibkit.estimation.turns import Turns, in_order
+from calibkit.estimation.turns import in_order
 from calibkit.geometry import se3
 from calibkit.geometry.so3 import Array
 from calibkit.geometry.spline import Knots
@@ -173,7 +173,7 @@ def _calibrate(cameras: Sequence[CameraInput], imus: Sequence[_Measured], settin
     turns = [fit_time_offset(each, imu, TurnSettings()) for each in progress(turned, "time offset", len(poses))]
     seeds = tuple(seed_camera(pose, turn, imu) for pose, turn in zip(poses, turns, strict=True))
     others = progress(imus[1:], "time offset of IMUs", len(imus) - 1) if len(imus) > 1 else ()
-    beside = tuple(_seed_beside(each, imu, poses[0], turned[0], seeds[0]) for each in others)
+    beside = tuple(seed_imu(each.corrected, each.of_input.name, imu, poses[0], turned[0], seeds[0]) for each in others)
     recorded = _Recorded(tuple(cameras), tuple(poses), turns[0].alignment.track.origin_ns, tuple(imus), beside, settings)
     begun = [_begin(recorded, seeds), *(_begin(recorded, each) for each in rival_seeds(poses, turned, turns, imu, seeds))]
     fit, best, rival = fit_best([(each.problem, each.start) for each in begun])
@@ -252,14 +252,6 @@ def _begin(recorded: _Recorded, seeds: tuple[CameraSeed, ...]) -> _Begun:
     )
     shut = tuple(replace(x, line_delay=delay) for x, delay in zip(start.cameras, delays, strict=True))
     return _Begun(seeds, problem, replace(start, imu=settings.imu, cameras=shut, beside=states), tuple(used), fine)
-
-
-def _seed_beside(each: _Measured, reference: ImuSamples, poses: BoardPoses, turned: Turns, seed: CameraSeed) -> ImuSeed:
-    try:
-        return seed_imu(each.corrected, reference, poses, turned, seed)
-    except BadInputError as error:  # as the time offset calls them
-        text = str(error).replace("the first", each.of_input.name).replace("the second", "the reference IMU")
-        raise BadInputError(text) from None
 
 
 def _beside(each: _Measured, seed: ImuSeed, origin_ns: int, knots: Knots) -> ImuBeside:

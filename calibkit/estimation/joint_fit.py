@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibkit.estimation.joint_noise import DRAWS, Component, Drawn, components, draw
-from calibkit.estimation.joint_parts import Epochs
+from calibkit.estimation.joint_parts import Epochs, Part
 from calibkit.estimation.joint_problem import DAMPING, JointProblem
 from calibkit.estimation.joint_state import JointState, of_imu
 from calibkit.geometry import se3
@@ -77,9 +77,7 @@ def refine(rough: RoughFit) -> JointFit:
     for rest in reversed(range(_ROUNDS)):
         solution = minimise(problem, x, max_steps=20, tolerance=_TIGHT, damping=DAMPING)
         x, steps = solution.x, steps + solution.steps
-        parts = list(problem.parts(x))
-        _, system = problem.assembled(parts, x)
-        drawn = draw(system, DRAWS)
+        parts, system, drawn = _linearised(problem, x)
         spent = components(parts, drawn)
         scales = {kind: part.factor for kind, part in spent.items() if kind not in ("walk", "stays")}
         if not rest or _settled(scales):
@@ -91,10 +89,14 @@ def refine(rough: RoughFit) -> JointFit:
 
 def around(problem: JointProblem, x: JointState) -> tuple[Arrowhead, Drawn, Epochs]:
     """Return the normal equations at x, states drawn from them, and what each epoch says of the border."""
+    parts, system, drawn = _linearised(problem, x)
+    return system, drawn, Epochs.of(parts, drawn.core_answer)
+
+
+def _linearised(problem: JointProblem, x: JointState) -> tuple[list[Part], Arrowhead, Drawn]:
     parts = list(problem.parts(x))
     _, system = problem.assembled(parts, x)
-    drawn = draw(system, DRAWS)
-    return system, drawn, Epochs.of(parts, drawn.core_answer)
+    return parts, system, draw(system, DRAWS)
 
 
 def _settled(scales: dict[str, float]) -> bool:

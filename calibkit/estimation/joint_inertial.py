@@ -135,16 +135,17 @@ def inertial_parts(
     """
     imu, own, t, accel = x.imus[j], biases(j), rows.t[some], rows.accel[some]
     model, clock, of = imu.model, imu.dt if j else 0.0, imu if j else None
+    measured = _measured_force(model, accel)
     i, u = knots.locate(t + clock)
     places = Places.of(knots, i, u, many=not _by_sample(model, border.free_of(j)))
     _, felt = feel(x, knots, steps, of, t, jacobians=places.at is None)
     if places.at is None:
-        columns = _columns(border, j, model, felt, _measured_force(model, accel))
+        columns = _columns(border, j, model, felt, measured)
     else:
         _, there = feel(x, knots, steps, of, places.at - clock)
         columns = _columns(border, j, model, there, np.zeros((len(places.at), 3)))
     bias, turns, sensitive = imu.bias[i], model.M_g @ model.C_g_i, model.A_g @ model.C_g_i
-    left_gyro = rows.gyro[some] - felt.omega @ turns.T - _measured_force(model, accel) @ sensitive.T - bias[:, :3]
+    left_gyro = rows.gyro[some] - felt.omega @ turns.T - measured @ sensitive.T - bias[:, :3]
     left_accel = accel - felt.force @ model.M_a.T - bias[:, 3:]
 
     def part(kind: str, K: Array, left: Array, sigma: Array, keep: NDArray[np.bool_], offsets: Index) -> Part:

@@ -12,7 +12,7 @@ from calibkit.estimation.board_poses import BoardPoses
 from calibkit.estimation.joint_accelerations import Accelerations, camera_accelerations, lag_of, rotation_of, turned_about
 from calibkit.estimation.joint_state import CameraState, JointState
 from calibkit.estimation.orientation_track import OrientationTrack
-from calibkit.estimation.time_offset import Settings, TimeOffsetFit, fit_time_offset
+from calibkit.estimation.time_offset import Settings, TimeOffsetFit, called, fit_time_offset
 from calibkit.estimation.time_offset_start import find_starts
 from calibkit.estimation.time_offset_verdict import ALIKE, judge_time_offset
 from calibkit.estimation.turns import Turns, turns_of_gyro
@@ -63,13 +63,15 @@ class ImuSeed:
     turns: TimeOffsetFit  # of its gyroscope against the reference's
 
 
-def seed_imu(imu: ImuSamples, reference: ImuSamples, poses: BoardPoses, turned: Turns, seed: CameraSeed) -> ImuSeed:
+def seed_imu(imu: ImuSamples, name: str, reference: ImuSamples, poses: BoardPoses, turned: Turns, seed: CameraSeed) -> ImuSeed:
     """Return a further IMU's start: as both gyroscopes turn, or through a camera where those do not tell."""
-    fit = fit_time_offset(turns_of_gyro(imu), reference, Settings())
+    with called(name, "the reference IMU"):
+        fit = fit_time_offset(turns_of_gyro(imu), reference, Settings())
     judged = judge_time_offset("dt", "ref", "imu", fit, {})
     if judged.status is not Status.NOT_OBSERVABLE and not len(open_axes(fit.alignment)):
         return ImuSeed(fit.alignment.R, fit.td, fit)
-    through = seed_camera(poses, fit_time_offset(turned, imu, Settings()), imu)
+    with called("the first", name):
+        through = seed_camera(poses, fit_time_offset(turned, imu, Settings()), imu)
     return ImuSeed(through.R_cam_imu.T @ seed.R_cam_imu, seed.td - through.td, fit)
 
 

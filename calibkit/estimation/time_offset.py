@@ -3,7 +3,8 @@
 t_to = t_of + td: the turns of `of` are looked up at t + td in the orientation track of `to`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,6 +98,15 @@ class TimeOffsetFit:
         k = int(np.argmin(self.cost))
         sides = (self.cost[: k + 1].max(), self.cost[k:].max())
         return float(min(sides) - self.cost[k]) / inflation(self.covariance)
+
+
+@contextmanager
+def called(first: str, second: str) -> Iterator[None]:
+    """Give the two streams that `fit_time_offset` is fed their names in what it refuses."""
+    try:
+        yield
+    except BadInputError as error:
+        raise BadInputError(str(error).replace("the first", first).replace("the second", second)) from None
 
 
 def fit_time_offset(turns: Turns, reference: ImuSamples | PoseSamples, settings: Settings, progress: Progress = silent) -> TimeOffsetFit:

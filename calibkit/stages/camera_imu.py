@@ -15,6 +15,7 @@ from calibkit.estimation.joint import CameraInput, ImuGiven, ImuNoise, Joint, Se
 from calibkit.estimation.joint_imu import ImuInput, imu_input
 from calibkit.estimation.joint_problem import GravityPrior
 from calibkit.estimation.stamps import StampReport, check_stamps
+from calibkit.estimation.time_offset import called
 from calibkit.io.imu_options import ImuOptions
 from calibkit.io.recording import Recording, open_recording
 from calibkit.io.target_file import load_target
@@ -92,17 +93,17 @@ class CameraImu(CamerasRead):
 
     def fitted(self, cameras: Sequence[CameraInput], settings: Settings, progress: Progress) -> Joint:
         """Return the joint estimate; BadInputError names the recording and the sensors."""
+        seen, imu = ", ".join(self.names), ", ".join(each.name for each in self.imus)
+        beside = [
+            ImuGiven(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras, each.name)
+            for each in self.imus[1:]
+        ]
         try:
-            beside = [
-                ImuGiven(each.input.samples, _noise(each.known), each.input.model, each.input.information, each.input.extras, each.name)
-                for each in self.imus[1:]
-            ]
-            return calibrate_joint(cameras, self.imu.input.samples, _noise(self.imu.known), settings, progress, beside)
+            with called(seen, imu):
+                return calibrate_joint(cameras, self.imu.input.samples, _noise(self.imu.known), settings, progress, beside)
         except BadInputError as error:
             damaged = "".join(f" ({text})" for text in self.recording.warnings)  # what was not read may be why
-            seen, imu = ", ".join(self.names), ", ".join(each.name for each in self.imus)
-            text = str(error).replace("the first", seen).replace("the second", imu)  # as the time offset calls them
-            raise BadInputError(f"{self.recording.name}: {seen} and {imu}: {text}{damaged}") from None
+            raise BadInputError(f"{self.recording.name}: {seen} and {imu}: {error}{damaged}") from None
 
 
 def read_camera_imu(
